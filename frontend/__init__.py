@@ -1,0 +1,1 @@
+"""Images to relative poses: everything that touches pixels (OpenCV and numpy, never gtsam)."""

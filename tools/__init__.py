@@ -1,0 +1,1 @@
+"""Commands, files, progress and drawing: the only place with input and output."""
