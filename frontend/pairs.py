@@ -1,0 +1,65 @@
+"""Which pairs of frames to compare: neighbours in time, skips over failures, retrieved frames."""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from groundfuse.backend.measurement import FrameId
+from groundfuse.frontend.features import Features
+from groundfuse.frontend.retrieval import RetrievalOptions, retrieved
+
+Pair = tuple[FrameId, FrameId]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PairOptions:
+    """Options of the choice of pairs.
+
+    Attributes:
+        retrieval: see `RetrievalOptions`.
+        max_skip: a failed neighbour is bridged over at most this many frames.
+    """
+
+    retrieval: RetrievalOptions = field(default_factory=RetrievalOptions)
+    max_skip: int = 3
+
+
+def neighbour_pairs(frames: Sequence[FrameId]) -> list[Pair]:
+    """Return consecutive frames of each robot."""
+    order = sorted(frames)
+    return [(a, b) for a, b in zip(order, order[1:], strict=False) if a.robot == b.robot]
+
+
+def retrieved_pairs(features: Mapping[FrameId, Features], options: PairOptions) -> list[Pair]:
+    """Return pairs that look alike, anywhere in the team."""
+    order = sorted(features)
+    found = retrieved([features[f] for f in order], options.retrieval)
+    return [(order[i], order[j]) for i, j in found]
+
+
+def skip_pairs(
+    frames: Sequence[FrameId], joined: Collection[Pair], skip: int
+) -> list[Pair]:
+    """Return pairs `skip` frames apart that would bridge a place where the chain is cut.
+
+    The chain is cut between two consecutive frames if no accepted pair of the robot spans the gap.
+
+    Args:
+        frames: all frames.
+        joined: accepted pairs so far.
+        skip: distance in frames, at least 2.
+    """
+    by_robot: dict[str, list[FrameId]] = {}
+    for frame in sorted(frames):
+        by_robot.setdefault(frame.robot, []).append(frame)
+    wanted: list[Pair] = []
+    for order in by_robot.values():
+        place = {frame: k for k, frame in enumerate(order)}
+        spanned = [False] * len(order)
+        for a, b in joined:
+            if a in place and b in place:
+                first, last = sorted((place[a], place[b]))
+                spanned[first:last] = [True] * (last - first)
+        for start in range(len(order) - skip):
+            if not all(spanned[start : start + skip]):
+                wanted.append((order[start], order[start + skip]))
+    return [pair for pair in wanted if pair not in joined]

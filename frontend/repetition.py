@@ -1,0 +1,47 @@
+"""Does the floor repeat itself? The highest second peak of one view's autocorrelation.
+
+A floor that repeats lies to every matcher: views one period apart look the same. One view alone
+shows it: identical tiles have a second peak near 1, floors that never repeat stay low.
+"""
+
+import math
+
+import cv2
+import numpy as np
+from scipy.signal import fftconvolve
+
+from groundfuse.frontend.arrays import Mask, Picture32
+
+REPEATS = 0.5
+"""A second peak above this marks a floor as repeating."""
+WORKING_PX = 160
+MIN_OVERLAP = 0.3
+MAIN_LOBE_SHARE = 0.06
+
+
+def repetition(normalised: Picture32, mask: Mask) -> float:
+    """Return the correlation of a view with itself at its best shift, 0 to 1.
+
+    Shifts within the main lobe, or with too little overlap, do not count.
+
+    Args:
+        normalised: (rows, columns) overhead view after local contrast normalisation.
+        mask: (rows, columns) pixels with floor.
+    """
+    shrink = max(1.0, max(normalised.shape) / WORKING_PX)
+    size = tuple(max(8, math.ceil(side / shrink)) for side in normalised.shape[::-1])
+    weight = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    # A neighbourhood average removes noise that no repetition could survive.
+    value = cv2.resize(normalised, size, interpolation=cv2.INTER_AREA) * (weight > 0.99)
+    weight = (weight > 0.99).astype(np.float32)
+    product = fftconvolve(value, value[::-1, ::-1])
+    power = fftconvolve(value * value, weight[::-1, ::-1])
+    norm = np.sqrt(np.maximum(power * power[::-1, ::-1], 0.0))
+    overlap = fftconvolve(weight, weight[::-1, ::-1])
+    rows, columns = product.shape
+    away = np.hypot(*np.ogrid[-(rows // 2) : rows - rows // 2, -(columns // 2) : columns - columns // 2])
+    counted = (overlap > MIN_OVERLAP * weight.sum()) & (away > MAIN_LOBE_SHARE * max(size))
+    counted &= norm > 1e-6 * max(float(norm.max()), 1e-12)
+    if not counted.any():
+        return 0.0
+    return float(np.clip((product[counted] / norm[counted]).max(), 0.0, 1.0))
