@@ -156,7 +156,8 @@ def _sampled_floor(camera: Camera, attitude: Attitude) -> tuple[Points, Floats]:
     px = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     floor = floor_from_rays(attitude, camera.intrinsics.rays_from_px(px))
     lattice = floor.reshape(len(v), len(u), 2)
-    by_v, by_u = np.gradient(lattice, v, u, axis=(0, 1))
+    by_v = np.asarray(np.gradient(lattice, v, axis=0), dtype=np.float64)
+    by_u = np.asarray(np.gradient(lattice, u, axis=1), dtype=np.float64)
     return floor, singular_values(by_u, by_v)[0].ravel()
 
 

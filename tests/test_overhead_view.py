@@ -67,8 +67,10 @@ def centres(grid):
     return grid.floor_from_overhead(np.stack([u, v], axis=-1).reshape(-1, 2))
 
 
-@pytest.mark.parametrize("lens", LENSES)
-@pytest.mark.parametrize("name", ATTITUDES)
+@pytest.mark.parametrize(
+    ("lens", "name"),
+    [("pinhole", name) for name in ATTITUDES] + [("plumb_bob", "33"), ("fisheye", "45")],
+)
 def test_the_view_shows_the_floor(lens, name):
     attitude = ATTITUDES[name]
     camera = camera_of(LENSES[lens], attitude)
@@ -114,7 +116,7 @@ def test_pixels_and_metres_go_round(cell_m, corner, px):
     np.testing.assert_allclose(there_and_back, points, atol=1e-11)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=25)
 @given(st.floats(-0.9, 1.2), st.floats(-0.2, 0.2), st.sampled_from(sorted(LENSES)))
 def test_the_grid_covers_the_useful_floor_and_no_more(tilt, roll, lens):
     attitude = Attitude(tilt, roll, 0.55)
@@ -167,12 +169,12 @@ def test_fine_detail_averages_out_instead_of_aliasing():
 
 def test_a_lens_that_folds_does_not_show_the_floor_twice():
     lens = Intrinsics(
-        640, 480, 300.0, 300.0, 320.0, 240.0, Distortion.PLUMB_BOB, (-0.12, 0.0, 0.0, 0.0, 0.0)
+        320, 240, 150.0, 150.0, 160.0, 120.0, Distortion.PLUMB_BOB, (-0.12, 0.0, 0.0, 0.0, 0.0)
     )
     attitude = Attitude(math.radians(45), 0.0, 0.55)
     camera = camera_of(lens, attitude)
-    grid = OverheadGrid(0.01, 8.0, 8.0, 1600, 1600, 20.0)
-    _, mask = overhead_view(np.zeros((480, 640), np.uint8), camera, attitude, grid)
+    grid = OverheadGrid(0.02, 8.0, 8.0, 800, 800, 20.0)
+    _, mask = overhead_view(np.zeros((240, 320), np.uint8), camera, attitude, grid)
     rays = rays_from_floor(attitude, centres(grid)[mask.ravel()])
     back = lens.rays_from_px(lens.px_from_rays(rays))
     np.testing.assert_allclose(back, rays, atol=1e-6)
