@@ -26,6 +26,20 @@ def _refusal(path: Path, error: OSError) -> DataError:
     return DataError(f"{path}: cannot write: {why}")
 
 
+def read_text(path: Path) -> str:
+    """Return the text of a UTF-8 file, with or without a byte order mark.
+
+    Raises:
+        DataError: it can't be read, or isn't UTF-8.
+    """
+    try:
+        return path.read_text("utf-8-sig")
+    except OSError as error:
+        raise DataError(f"{path}: cannot read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: not a text file in UTF-8 (byte {error.start})") from error
+
+
 def make_folder(folder: Path) -> Path:
     """Return the folder, made with its parents where it was missing.
 
