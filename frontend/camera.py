@@ -80,6 +80,10 @@ class Intrinsics:
 
     def _polished(self, rays: Points, points_px: Points) -> Points:
         """Newton on the forward model: OpenCV 4 stops after five fixed-point steps."""
+        with np.errstate(divide="ignore", over="ignore", invalid="ignore"):  # no ray: becomes nan
+            return self._newton(rays, points_px)
+
+    def _newton(self, rays: Points, points_px: Points) -> Points:
         for _ in range(NEWTON_STEPS):
             error = self.px_from_rays(rays) - points_px
             ju = (

@@ -127,7 +127,7 @@ def _intrinsics(document: dict[str, Any]) -> Intrinsics:
         raise ValueError(f"focal lengths must be positive, got {fx:g} and {fy:g} px")
     name = str(document["distortion_model"]).strip().casefold()
     name = OTHER_NAMES.get(name, name)
-    refuse_unknown([name], tuple(Distortion), "distortion_model")
+    refuse_unknown([name], [model.value for model in Distortion], "distortion_model")
     model = Distortion(name)
     coefficients = _numbers(
         document.get("distortion_coefficients") or [],

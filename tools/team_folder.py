@@ -45,10 +45,13 @@ def list_robots(folder: Path) -> tuple[str, ...]:
 def read_team(folder: Path, robots: Sequence[str]) -> tuple[Robot, ...]:
     """Return the named robots, with every file checked but no picture decoded.
 
+    A slash after a name, as shells add it, doesn't matter.
+
     Raises:
         DataError: whatever is missing or wrong.
     """
     known = list_robots(folder)
+    robots = [name.rstrip("/") or name for name in robots]
     if not robots:
         raise DataError(f"{folder}: no robot named, found {', '.join(known) or 'none'}")
     for name, count in Counter(robots).items():

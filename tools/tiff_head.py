@@ -6,6 +6,7 @@ from typing import BinaryIO
 WIDTH, HEIGHT = 256, 257
 OFFSETS, COUNTS = (273, 324), (279, 325)  # of strips, of tiles
 SHORT, LONG = 3, 4
+TYPE_BYTES = (0, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8)
 
 
 def tiff_size(stream: BinaryIO, num_bytes: int) -> tuple[int, int]:
@@ -27,7 +28,10 @@ def tiff_size(stream: BinaryIO, num_bytes: int) -> tuple[int, int]:
     entries = [stream.read(12) for _ in range(num_entries)]
     values: dict[int, tuple[int, ...]] = {}
     for entry in entries:
-        tag, kind, count = struct.unpack(order + "HHI", entry[:8])
+        tag, kind, count, offset = struct.unpack(order + "HHII", entry)
+        length = count * (TYPE_BYTES[kind] if kind < len(TYPE_BYTES) else 0)
+        if length > 4 and offset + length > num_bytes:
+            raise ValueError(f"it is cut short after {num_bytes} bytes")
         if tag in (WIDTH, HEIGHT, *OFFSETS, *COUNTS) and kind in (SHORT, LONG):
             values[tag] = _values(stream, order, entry, kind, count)
     if not values.get(WIDTH) or not values.get(HEIGHT):

@@ -38,7 +38,7 @@ def read_mapping(path: Path) -> dict[str, Any]:
     try:
         documents = list(yaml.load_all(text, _UniqueKeys))
     except yaml.YAMLError as error:
-        raise DataError(f"{path}: not YAML: {_one_line(error)}") from error
+        raise DataError(f"{path}: not YAML: {_one_line(error, text)}") from error
     except ValueError as error:
         raise DataError(f"{path}: {error}") from error
     full = [document for document in documents if document is not None]
@@ -48,10 +48,10 @@ def read_mapping(path: Path) -> dict[str, Any]:
     return {str(key): value for key, value in full[0].items()}
 
 
-def _one_line(error: yaml.YAMLError) -> str:
+def _one_line(error: yaml.YAMLError, text: str) -> str:
     mark = getattr(error, "problem_mark", None)
     problem = getattr(error, "problem", None) or str(error).splitlines()[0]
     where = "" if mark is None else f"line {mark.line + 1}: "
-    opencv = "opencv-matrix" in str(error)
+    opencv = "opencv-matrix" in text or text.startswith("%YAML:")
     hint = " (an OpenCV FileStorage file; a ROS camera_info file is needed)" if opencv else ""
     return f"{where}{problem}{hint}"
