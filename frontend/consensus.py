@@ -120,15 +120,17 @@ def find_modes(
         return []
     hypotheses = hypotheses[: options.max_hypotheses]
     votes = _votes(found, hypotheses, tolerance_m, options.max_turn_rad)
+    motions: list[Floats] = []
     modes: list[Mode] = []
     while len(hypotheses) and len(modes) < options.num_modes:
-        best = hypotheses[int(np.argmax(votes))]
-        best, count = _refined(found, best, tolerance_m, max_log_scale, options)
-        modes.append(_mode(found, best, count, tolerance_m, options))
-        far, turn = _apart(hypotheses, best, centre)
-        apart = (far > options.distinct_tolerances * tolerance_m) | (
-            turn > options.distinct_turn_rad
-        )
+        start = hypotheses[int(np.argmax(votes))]
+        best, count = _refined(found, start, tolerance_m, max_log_scale, options)
+        # A start on the slope of a known mode climbs back to it: no rival.
+        if all(_distinct(other[None], best, centre, tolerance_m, options)[0] for other in motions):
+            motions.append(best)
+            modes.append(_mode(found, best, count, tolerance_m, options))
+        apart = _distinct(hypotheses, best, centre, tolerance_m, options)
+        apart &= _distinct(hypotheses, start, centre, tolerance_m, options)
         hypotheses, votes = hypotheses[apart], votes[apart]
     return sorted(modes, key=lambda mode: -mode.votes)
 
@@ -263,6 +265,14 @@ def _apart(motions: Floats, other: Floats, centre: Floats) -> tuple[Floats, Floa
     dy = change[:, 1] * centre[0] + change[:, 0] * centre[1] + change[:, 3]
     turn = np.arctan2(motions[:, 1], motions[:, 0]) - np.arctan2(other[1], other[0])
     return np.hypot(dx, dy), np.abs(np.remainder(turn + np.pi, 2 * np.pi) - np.pi)
+
+
+def _distinct(
+    motions: Floats, other: Floats, centre: Floats, tolerance_m: float, options: ConsensusOptions
+) -> Mask:
+    far, turn = _apart(motions, other, centre)
+    apart: Mask = far > options.distinct_tolerances * tolerance_m
+    return apart | (turn > options.distinct_turn_rad)
 
 
 def one_to_one(

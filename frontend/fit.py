@@ -30,15 +30,13 @@ class FitOptions:
         cauchy_sigmas: Cauchy kernel's width, in estimated sigmas.
         gate_sigmas: residual length above which a correspondence is dropped.
         min_noise: smallest factor by which a pair's noise may fall below the detector's model.
-        correlation: factor on the variance for errors that neighbouring features share.
     """
 
     robust_iterations: int = 15
     final_iterations: int = 4
     cauchy_sigmas: float = 2.0
     gate_sigmas: float = 3.5
-    min_noise: float = 0.5
-    correlation: float = 1.0
+    min_noise: float = 0.28
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,7 +135,9 @@ def fit_pair(
     length = np.linalg.norm(residual, axis=1)
     noise = _noise(length[length < options.gate_sigmas * noise], options)
     inliers: Mask = length < options.gate_sigmas * noise
-    weight = inliers / (noise**2 * options.correlation)
+    # Tails are heavier than a Gaussian's: what counts for the covariance is the mean square.
+    noise = max(noise, float(np.sqrt((length[inliers] ** 2).sum() / _freedom(inliers))))
+    weight = inliers / noise**2
     for _ in range(options.final_iterations):
         residual, jacobian = _whitened(points, state, whitening)
         hessian, step = _step(residual, jacobian, weight, information, mean - state.attitude)
@@ -169,6 +169,11 @@ def _noise(length: Floats, options: FitOptions) -> float:
     """Noise as a multiple of the model, from the median residual length."""
     median = float(np.median(length)) if len(length) else np.inf
     return max(options.min_noise, median * MAD_TO_SIGMA)
+
+
+def _freedom(inliers: Mask) -> float:
+    """Residual coordinates less the parameters that they determine, at least one."""
+    return max(1.0, 2.0 * float(inliers.sum()) - 9.0)
 
 
 def _step(
