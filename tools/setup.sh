@@ -27,7 +27,7 @@ CHECK
     fi
   done
   say "needs Python 3.11, 3.12 or 3.13 with its venv module, found none" \
-    "(${PYTHON:-python3}: $(${PYTHON:-python3} --version 2>&1 || true));" \
+    "(${PYTHON:-python3}: $(${PYTHON:-python3} --version 2>&1 | head -1));" \
     "on Debian: apt-get install python3-venv"
   return 1
 }
