@@ -1,11 +1,12 @@
 """Resample a picture so that each output cell is the mean of the picture over that cell."""
 
 import math
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from groundfuse.frontend.arrays import Floats, Image, Mask
+from groundfuse.frontend.arrays import Floats, Image, Mask, Picture32
 
 MAX_SUPERSAMPLING = 8
 JACOBIAN_STEP = 4
@@ -21,28 +22,60 @@ def singular_values(by_u: Floats, by_v: Floats) -> tuple[Floats, Floats]:
     return (plus + minus) / 2.0, np.abs(plus - minus) / 2.0
 
 
+class AreaPlan(NamedTuple):
+    """Where each cell of an output picture reads, worked out once for many pictures.
+
+    Attributes:
+        level: halvings of the picture that lose nothing.
+        samples: samples per side of a cell.
+        map_u: (rows * samples, columns * samples) picture columns at that level.
+        map_v: the same for rows.
+    """
+
+    level: int
+    samples: int
+    map_u: Picture32
+    map_v: Picture32
+
+
+def area_plan(source_px: Floats, wanted: Mask) -> AreaPlan:
+    """Plan the reading of cells.
+
+    Args:
+        source_px: (rows + 2, columns + 2, 2) picture coordinates of the cells' centres, with a
+            margin of one cell; nan where a cell has none.
+        wanted: (rows, columns) cells that matter; the others hold anything.
+    """
+    level, samples = _level_and_factor(source_px, wanted)
+    maps = np.nan_to_num(source_px / 2.0**level, nan=OUTSIDE_PX).astype(np.float32)
+    fine = cv2.resize(maps, None, fx=samples, fy=samples, interpolation=cv2.INTER_LINEAR)
+    map_u, map_v = cv2.split(fine[samples:-samples, samples:-samples])
+    return AreaPlan(level, samples, map_u, map_v)
+
+
 def area_remap(pyramid: list[Image], source_px: Floats, wanted: Mask) -> Image:
+    """Plan and read at once; see `area_plan` and `area_read`."""
+    return area_read(pyramid, area_plan(source_px, wanted))
+
+
+def area_read(pyramid: list[Image], plan: AreaPlan) -> Image:
     """Average the picture over each cell: the pyramid level that loses nothing, supersampled.
 
     Where the picture is coarser than the cells it is interpolated (bicubic).
 
     Args:
         pyramid: the picture, then halvings of it; grows where more are needed.
-        source_px: (rows + 2, columns + 2, 2) picture coordinates of the cells' centres, with a
-            margin of one cell; nan where a cell has none.
-        wanted: (rows, columns) cells that matter; the others hold anything.
+        plan: where each cell reads.
     """
-    level, factor = _level_and_factor(source_px, wanted)
-    while len(pyramid) <= level:
+    while len(pyramid) <= plan.level:
         pyramid.append(np.asarray(cv2.pyrDown(pyramid[-1]), dtype=pyramid[0].dtype))
-    maps = np.nan_to_num(source_px / 2.0**level, nan=OUTSIDE_PX).astype(np.float32)
-    fine = cv2.resize(maps, None, fx=factor, fy=factor, interpolation=cv2.INTER_LINEAR)
-    map_u, map_v = cv2.split(fine[factor:-factor, factor:-factor])
-    interpolation = cv2.INTER_CUBIC if factor == 1 else cv2.INTER_LINEAR
+    interpolation = cv2.INTER_CUBIC if plan.samples == 1 else cv2.INTER_LINEAR
+    picture = pyramid[plan.level]
     sampled = cv2.remap(
-        pyramid[level], map_u, map_v, interpolation, borderMode=cv2.BORDER_REPLICATE
+        picture, plan.map_u, plan.map_v, interpolation, borderMode=cv2.BORDER_REPLICATE
     )
-    size = (wanted.shape[1], wanted.shape[0])
+    rows, columns = plan.map_u.shape
+    size = (columns // plan.samples, rows // plan.samples)
     averaged = cv2.resize(sampled, size, interpolation=cv2.INTER_AREA)
     return np.asarray(averaged, dtype=pyramid[0].dtype)
 

@@ -4,6 +4,7 @@ Forward is up and left is left: the centre of raster pixel (u, v) lies at x = x_
 y = y_m - u m_per_px in `foot` (see `camera.py` for the frames). Paper §2, eq. 1, for any lens.
 """
 
+import functools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,13 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from groundfuse.backend.measurement import Attitude
-from groundfuse.frontend.area_remap import area_remap, singular_values
+from groundfuse.frontend.area_remap import AreaPlan, area_plan, area_read, singular_values
 from groundfuse.frontend.arrays import Floats, Image, Mask, Points
 from groundfuse.frontend.camera import Camera
 from groundfuse.frontend.overhead import floor_from_rays, rays_from_floor
 
 TILE_PX = 256
 """Raster pixels per tile: remap takes no picture of 32767 px or more, and no tile needs many."""
+PLANS_KEPT = 4
+"""Some 10 MB each; a team of many cameras works them out again."""
 LATTICE_STEP_PX = 4
 
 
@@ -136,15 +139,26 @@ def overhead_view(
     view = np.zeros((grid.height_px, grid.width_px, *image.shape[2:]), dtype=image.dtype)
     mask = np.zeros((grid.height_px, grid.width_px), dtype=np.bool_)
     pyramid = [image]
+    for rows, columns, seen, plan in _planned_tiles(camera, attitude, grid):
+        view[rows, columns] = area_read(pyramid, plan)
+        view[rows, columns][~seen] = 0
+        mask[rows, columns] = seen
+    return view, mask
+
+
+@functools.lru_cache(maxsize=PLANS_KEPT)
+def _planned_tiles(
+    camera: Camera, attitude: Attitude, grid: OverheadGrid
+) -> tuple[tuple[slice, slice, Mask, AreaPlan], ...]:
+    """Tiles with floor and where they read; most frames of a robot share camera and attitude."""
     widest = _widest_ray(camera)
+    planned = []
     for rows, columns in _tiles(grid):
         source_px = _source_px(camera, attitude, grid, (rows, columns), widest)
         seen = _seen(source_px[1:-1, 1:-1], camera) & _near(grid, rows, columns)
         if seen.any():
-            view[rows, columns] = area_remap(pyramid, source_px, seen)
-            view[rows, columns][~seen] = 0
-            mask[rows, columns] = seen
-    return view, mask
+            planned.append((rows, columns, seen, area_plan(source_px, seen)))
+    return tuple(planned)
 
 
 def _sampled_floor(camera: Camera, attitude: Attitude) -> tuple[Points, Floats]:
