@@ -6,7 +6,7 @@ Conventions: metres and radians; `a_from_b` maps b-coordinates to a-coordinates;
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Self
 
@@ -121,6 +121,7 @@ class Reason(StrEnum):
     PRIOR = "prior"
     UNREADABLE = "unreadable"
     INCONSISTENT = "inconsistent"
+    UNDECIDED = "undecided"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -222,6 +223,14 @@ class Rejected:
     limit: float
 
 
+class EdgeKind(StrEnum):
+    """What an edge is for the team: a step of a trajectory, or a meeting of two places of it."""
+
+    CHAIN = "chain"
+    LOOP = "loop"
+    OVERLAP = "overlap"
+
+
 @dataclass(frozen=True, slots=True)
 class EdgeVerdict:
     """What the team graph made of one measured edge.
@@ -230,8 +239,12 @@ class EdgeVerdict:
         a: reference frame.
         b: measured frame.
         accepted: whether the edge took part in the final solution.
-        chi2: squared Mahalanobis residual at the solution, 3 degrees of freedom.
+        chi2: squared Mahalanobis residual at the solution, 3 degrees of freedom; infinite where
+            its two frames ended in different components.
         limit: the chi2 above which an edge is turned down.
+        kind: a step along a trajectory, a loop within one map, or an overlap of two maps.
+        reason: why it was turned down: INCONSISTENT with the rest, or UNDECIDED (another answer
+            has comparable support); None for an accepted edge.
     """
 
     a: FrameId
@@ -239,6 +252,8 @@ class EdgeVerdict:
     accepted: bool
     chi2: float
     limit: float
+    kind: EdgeKind = EdgeKind.OVERLAP
+    reason: Reason | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -254,6 +269,7 @@ class Anchor:
         covariance: (3, 3) tangent at the anchor, relative to the component's reference frame; None
             for the map that is the reference itself.
         num_overlaps: accepted edges between this map and others of the component.
+        rests_on_one: a single accepted edge alone ties this map to the component's reference.
     """
 
     robot: str
@@ -263,6 +279,35 @@ class Anchor:
     team_from_map: Se2
     covariance: Array | None
     num_overlaps: int
+    rests_on_one: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """One possible place of a map relative to another.
+
+    Attributes:
+        a: first frame of the one map.
+        b: first frame of the other.
+        a_from_b: pose of b in a.
+        support: overlaps between the two maps that agree with it.
+    """
+
+    a: FrameId
+    b: FrameId
+    a_from_b: Se2
+    support: int
+
+
+@dataclass(frozen=True, slots=True)
+class Ambiguity:
+    """Two maps whose overlaps allow several answers of comparable support; none was used.
+
+    Attributes:
+        answers: the possible answers, the best supported first.
+    """
+
+    answers: tuple[Answer, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -275,9 +320,13 @@ class TeamEstimate:
         covariance: (3, 3) per frame, tangent at the frame, relative to the component's reference
             (the first frame of the component's first robot, whose own covariance is absent).
         anchors: one per connected piece of each robot's trajectory.
-        verdicts: one per edge that was given.
+        verdicts: one per edge that was given, in the order given.
         chi2: sum of squared Mahalanobis residuals over accepted edges.
         degrees_of_freedom: 3 (accepted edges) - 3 (frames - components).
+        ambiguities: pairs of maps that could lie in several ways.
+        map_of: number of the map (connected piece of a trajectory) of every frame; index of
+            `anchors`.
+        map_from_base: pose of every frame in its map, chained along the trajectory's steps alone.
     """
 
     team_from_base: dict[FrameId, Se2]
@@ -287,3 +336,6 @@ class TeamEstimate:
     verdicts: tuple[EdgeVerdict, ...]
     chi2: float
     degrees_of_freedom: int
+    ambiguities: tuple[Ambiguity, ...] = ()
+    map_of: dict[FrameId, int] = field(default_factory=dict)
+    map_from_base: dict[FrameId, Se2] = field(default_factory=dict)

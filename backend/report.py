@@ -1,0 +1,204 @@
+"""From the solved graph to the border types: components, anchors, covariances, verdicts."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from groundfuse.backend import planar
+from groundfuse.backend.chain import Forest
+from groundfuse.backend.consistency import Flags
+from groundfuse.backend.covariance import marginals
+from groundfuse.backend.initial import layout_of
+from groundfuse.backend.measurement import (
+    Ambiguity,
+    Anchor,
+    Answer,
+    EdgeKind,
+    EdgeVerdict,
+    FrameId,
+    Reason,
+    TeamEstimate,
+)
+from groundfuse.backend.problem import Array, Indices, Problem, chi2_per_edge, components
+from groundfuse.backend.skeleton import Skeleton
+from groundfuse.backend.voting import Assignment, Vote
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Findings:
+    """The solved graph.
+
+    Attributes:
+        whole: all edges.
+        maps: chains of the maps.
+        poses: (n, 3) solution.
+        accepted: (m,) edges in the solution.
+        on_chain: (m,) edges of the chains.
+        undecided: (m,) edges withheld because another answer has comparable support.
+        team: the meeting poses, or None where no two maps meet.
+        verdict: the vote on them.
+    """
+
+    whole: Problem
+    maps: Forest
+    poses: Array
+    accepted: Flags
+    on_chain: Flags
+    undecided: Flags
+    team: Skeleton | None
+    verdict: Vote | None
+
+
+def estimate(order: Sequence[FrameId], found: Findings, limit: float) -> TeamEstimate:
+    """Return the border type; `limit` is the chi2 above which an edge was turned down."""
+    kept = found.whole.of(found.accepted)
+    part = components(kept)
+    layout = layout_of(kept)
+    poses = _from_reference(found.poses, part)
+    covariance = marginals(kept, poses, layout)
+    rank = _by_size(part)
+    free = layout.rank >= 0
+    error = chi2_per_edge(found.whole, poses)
+    error[part[found.whole.a] != part[found.whole.b]] = math.inf
+    return TeamEstimate(
+        team_from_base={f: planar.pose(p) for f, p in zip(order, poses, strict=True)},
+        component_of={f: int(rank[c]) for f, c in zip(order, part, strict=True)},
+        covariance={f: covariance[k] for k, f in enumerate(order) if free[k]},
+        anchors=_anchors(order, found, poses, covariance, rank[part]),
+        verdicts=_verdicts(order, found, error, limit),
+        chi2=float(error[found.accepted].sum()),
+        degrees_of_freedom=3 * len(kept) - 3 * int(free.sum()),
+        ambiguities=_ambiguities(order, found),
+        map_of={f: int(m) for f, m in zip(order, found.maps.part, strict=True)},
+        map_from_base={f: planar.pose(p) for f, p in zip(order, found.maps.poses, strict=True)},
+    )
+
+
+def _from_reference(poses: Array, part: Indices) -> Array:
+    """Put the first pose of every component at the origin."""
+    _, first = np.unique(part, return_index=True)
+    return planar.between(poses[first[part]], poses)
+
+
+def _by_size(part: Indices) -> Indices:
+    """Return the rank of every component: larger first, then earlier first."""
+    size = np.bincount(part)
+    order = np.argsort(-size, kind="stable")
+    rank = np.empty(len(size), dtype=np.int64)
+    rank[order] = np.arange(len(size))
+    return rank
+
+
+def _verdicts(
+    order: Sequence[FrameId], found: Findings, error: Array, limit: float
+) -> tuple[EdgeVerdict, ...]:
+    inner = found.maps.part[found.whole.a] == found.maps.part[found.whole.b]
+    verdicts = []
+    for k in range(len(found.whole)):
+        accepted = bool(found.accepted[k])
+        kind = EdgeKind.LOOP if inner[k] else EdgeKind.OVERLAP
+        reason = Reason.UNDECIDED if found.undecided[k] else Reason.INCONSISTENT
+        verdicts.append(
+            EdgeVerdict(
+                order[found.whole.a[k]],
+                order[found.whole.b[k]],
+                accepted,
+                float(error[k]),
+                limit,
+                EdgeKind.CHAIN if found.on_chain[k] else kind,
+                None if accepted else reason,
+            )
+        )
+    return tuple(verdicts)
+
+
+def _anchors(
+    order: Sequence[FrameId], found: Findings, poses: Array, covariance: Array, component: Indices
+) -> tuple[Anchor, ...]:
+    """Return one anchor per map, in the order of their first frames."""
+    part = found.maps.part
+    _, first = np.unique(part, return_index=True)
+    pairs = np.stack([part[found.whole.a], part[found.whole.b]], axis=1)[found.accepted]
+    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+    count = np.bincount(pairs.ravel(), minlength=len(first))
+    hanging = hanging_by_one(len(first), pairs)
+    anchors, seen = [], dict[str, int]()
+    for m, k in enumerate(first.tolist()):
+        robot = order[k].robot
+        seen[robot] = seen.get(robot, -1) + 1
+        anchors.append(
+            Anchor(
+                robot,
+                seen[robot],
+                int(component[k]),
+                order[k],
+                planar.pose(poses[k]),
+                covariance[k] if covariance[k].any() else None,
+                int(count[m]),
+                bool(hanging[m]),
+            )
+        )
+    return tuple(anchors)
+
+
+def hanging_by_one(num_maps: int, pairs: Indices) -> Flags:
+    """Return which maps one single edge alone ties to the first map of their component.
+
+    Args:
+        num_maps: number of maps.
+        pairs: (m, 2) maps of every accepted edge between maps.
+    """
+    hanging = np.zeros(num_maps, dtype=bool)
+    everything = _labels(num_maps, pairs)
+    unique, count = np.unique(np.sort(pairs, axis=1), axis=0, return_counts=True)
+    for pair in unique[count == 1]:
+        rest = pairs[~(np.sort(pairs, axis=1) == pair).all(axis=1)]
+        label = _labels(num_maps, rest)
+        if label[pair[0]] != label[pair[1]]:
+            head = everything.tolist().index(everything[pair[0]])
+            hanging |= (everything == everything[pair[0]]) & (label != label[head])
+    return hanging
+
+
+def _labels(num_maps: int, pairs: Indices) -> Indices:
+    poses, information = np.zeros((len(pairs), 3)), np.zeros((len(pairs), 3, 3))
+    return components(Problem(num_maps, pairs[:, 0], pairs[:, 1], poses, information))
+
+
+def _ambiguities(order: Sequence[FrameId], found: Findings) -> tuple[Ambiguity, ...]:
+    """Return, per pair of maps that answers place differently, the answers."""
+    if found.team is None or found.verdict is None or not found.verdict.rivals:
+        return ()
+    team, best = found.team, found.verdict.best
+    answers = [best, *found.verdict.rivals]
+    withheld = best.agreeing & ~found.verdict.sure
+    _, first = np.unique(found.maps.part, return_index=True)
+    result = []
+    for f, g in np.unique(team.maps[withheld], axis=0).tolist():
+        pair = (team.maps == [f, g]).all(axis=1)
+        distinct: list[Answer] = []
+        for assignment in answers:
+            support = int((assignment.agreeing & pair).sum())
+            if not support:
+                continue
+            pose = _place(found, team, assignment, pair)
+            a, b = order[first[f]], order[first[g]]
+            distinct.append(Answer(a, b, planar.pose(pose), support))
+        distinct.sort(key=lambda answer: -answer.support)
+        result.append(Ambiguity(_without_repeats(distinct)))
+    return tuple(result)
+
+
+def _place(found: Findings, team: Skeleton, assignment: Assignment, pair: Flags) -> Array:
+    """Return the first map's frame from the second's, as the first agreeing edge says."""
+    agreeing: Indices = np.flatnonzero(assignment.agreeing & pair)
+    k = int(agreeing[0])
+    poses, joins = found.maps.poses, team.joins
+    f_from_b = planar.compose(poses[team.node[joins.a[k]]], joins.a_from_b[k])
+    return planar.compose(f_from_b, planar.inverse(poses[team.node[joins.b[k]]]))
+
+
+def _without_repeats(answers: Sequence[Answer]) -> tuple[Answer, ...]:
+    return tuple(dict.fromkeys(answers))

@@ -1,0 +1,144 @@
+"""How the maps of a team lie: the assignment that most independent evidence agrees on.
+
+An assignment joins the maps by one hypothesis per join; every other overlap then agrees with it or
+does not. Its score counts closures (pairs of maps that agree beyond what a tree needs; closing by
+chance is rare however many overlaps repeat the same mistake) far above support, and support only by
+its logarithm, so that only a clear majority decides between two maps that nobody else sees.
+Assignments whose score is within `log(ambiguity_ratio)` of the best are open: only what all of them
+agree on is used.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from groundfuse.backend.chain import Forest
+from groundfuse.backend.consistency import Flags, links
+from groundfuse.backend.cycles import Cycle, closed_cycles
+from groundfuse.backend.hypotheses import Hypothesis, hypotheses
+from groundfuse.backend.problem import Indices
+from groundfuse.backend.skeleton import Skeleton, chi2_of_joins, joined
+
+CLOSURE = 7.0  # log of 1000: how rarely a wrong hypothesis closes a cycle by chance
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VotingOptions:
+    """How overlaps between maps are weighed.
+
+    Attributes:
+        limit: chi2 of 3 degrees of freedom above which overlaps or cycles disagree.
+        num_hypotheses: alternatives kept per pair of maps.
+        ambiguity_ratio: how many times the support of the next-best answer the best one needs.
+        max_alternatives: rival assignments examined.
+    """
+
+    limit: float = 16.27  # 99.9 %
+    num_hypotheses: int = 4
+    ambiguity_ratio: float = 2.0
+    max_alternatives: int = 100
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Assignment:
+    """One way to join the maps.
+
+    Attributes:
+        tree: candidate edges that join the maps, no cycle among them.
+        agreeing: (m,) whether each candidate agrees with the tree.
+        score: closures and support, in natural-log units.
+    """
+
+    tree: Indices
+    agreeing: Flags
+    score: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Vote:
+    """The outcome.
+
+    Attributes:
+        best: the assignment of the highest score.
+        rivals: other assignments that the data do not exclude.
+        sure: (m,) candidates that agree with the best assignment and with all rivals.
+    """
+
+    best: Assignment
+    rivals: tuple[Assignment, ...]
+    sure: Flags
+
+
+def vote(team: Skeleton, options: VotingOptions) -> Vote:
+    """Weigh all candidate joins of the team."""
+    chains = joined(team, np.empty(0, dtype=np.int64))
+    found = hypotheses(team, chains, options.limit, options.num_hypotheses)
+    cycles = closed_cycles(found, links(team.joins, chains), chains, options.limit)
+    best = _assignment(team, found, cycles, (), options.limit)
+    rivals = []
+    for forced in _alternatives(found, cycles, best)[: options.max_alternatives]:
+        rival = _assignment(team, found, cycles, forced, options.limit)
+        if rival.score > best.score:
+            best, rival = rival, best
+        rivals.append(rival)
+    margin = math.log(options.ambiguity_ratio) + 1e-9
+    open_rivals = tuple(r for r in rivals if r.score >= best.score - margin and _differ(r, best))
+    sure = np.logical_and.reduce([best.agreeing, *(r.agreeing for r in open_rivals)])
+    return Vote(best, open_rivals, sure)
+
+
+def _differ(one: Assignment, two: Assignment) -> bool:
+    return not np.array_equal(one.agreeing, two.agreeing)
+
+
+def _alternatives(
+    found: Sequence[Hypothesis], cycles: Sequence[Cycle], best: Assignment
+) -> list[Cycle]:
+    """Return what to force: cycles, then single hypotheses, that the best assignment refuses."""
+    refused = {k for k, h in enumerate(found) if not best.agreeing[h.seed]}
+    rival_cycles = [c for c in cycles if refused & set(c)]
+    rival_cycles.sort(key=lambda c: -sum(found[k].support for k in c))
+    singles = sorted(refused, key=lambda k: -found[k].support)
+    return [*rival_cycles, *((k,) for k in singles)]
+
+
+def _assignment(
+    team: Skeleton,
+    found: Sequence[Hypothesis],
+    cycles: Sequence[Cycle],
+    forced: Iterable[int],
+    limit: float,
+) -> Assignment:
+    """Join the maps: first by what is forced, then by votes and support (Kruskal)."""
+    votes = np.zeros(len(found))
+    for cycle in cycles:
+        votes[list(cycle)] += 1
+    first = list(forced)
+    order = sorted(range(len(found)), key=lambda k: (-votes[k], -found[k].support, k))
+    root = list(range(team.num_maps))
+
+    def top(k: int) -> int:
+        while root[k] != k:
+            root[k] = root[root[k]]
+            k = root[k]
+        return k
+
+    tree = []
+    for k in [*first, *order]:
+        f, g = (top(m) for m in found[k].maps)
+        if f != g:
+            root[f] = g
+            tree.append(found[k].seed)
+    return scored(team, np.array(tree, dtype=np.int64), limit)
+
+
+def scored(team: Skeleton, tree: Indices, limit: float) -> Assignment:
+    """Judge all candidates against the maps joined by `tree`."""
+    forest: Forest = joined(team, tree)
+    agreeing = chi2_of_joins(team, forest) <= limit
+    key = team.maps[agreeing, 0] * team.num_maps + team.maps[agreeing, 1]
+    _, support = np.unique(key, return_counts=True)
+    closures = len(support) - len(tree)
+    return Assignment(tree, agreeing, CLOSURE * closures + float(np.log(support).sum()))
