@@ -1,0 +1,137 @@
+"""The wheel holds every module and works without the checkout; the lock agrees with the project."""
+
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tomllib
+import zipfile
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+ROOT = Path(__file__).parents[1]
+ROOMS = ("frontend", "backend", "tools")
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+NOT_INSTALLED = {".sh"}
+"""`tools/setup.sh` sets a checkout up; whoever has the wheel is past that."""
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    """Build from a copy, as the build leaves its own folders behind."""
+    source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    for room in ROOMS:
+        shutil.copytree(
+            ROOT / room, source / room, ignore=shutil.ignore_patterns("__pycache__", ".*")
+        )
+    build = f"from setuptools import build_meta; build_meta.build_wheel({str(out)!r})"
+    done = subprocess.run(
+        [sys.executable, "-c", build], cwd=source, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    (built,) = out.glob("*.whl")
+    return built
+
+
+def members(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        return {name for name in archive.namelist() if not name.endswith("/")}
+
+
+def test_every_file_of_the_rooms_is_in_the_wheel(wheel):
+    expected = {
+        f"groundfuse/{path.relative_to(ROOT)}"
+        for room in ROOMS
+        for path in (ROOT / room).rglob("*")
+        if path.is_file()
+        and path.suffix not in NOT_INSTALLED
+        and not any(part == "__pycache__" or part.startswith(".") for part in path.parts[-2:])
+    }
+    assert len(expected) > 30
+    installed = {name for name in members(wheel) if ".dist-info/" not in name}
+    assert installed == expected
+
+
+def test_the_wheel_says_what_it_is(wheel):
+    assert wheel.name == f"groundfuse-{PROJECT['version']}-py3-none-any.whl"
+    with zipfile.ZipFile(wheel) as archive:
+        info = f"groundfuse-{PROJECT['version']}.dist-info"
+        metadata = archive.read(f"{info}/METADATA").decode()
+        commands = archive.read(f"{info}/entry_points.txt").decode()
+    assert "fuse-team = groundfuse.tools.fuse_team:main" in commands
+    assert f"{info}/licenses/LICENSE" in members(wheel)
+    assert "License-Expression: Apache-2.0" in metadata
+    for line in PROJECT["dependencies"]:
+        name = Requirement(line).name
+        assert re.search(rf"^Requires-Dist: {name}\b", metadata, re.MULTILINE), name
+
+
+def test_every_module_imports_from_the_wheel_alone(wheel, tmp_path):
+    """Without the editable install: -S leaves site's hooks out, so only the wheel can answer."""
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(tmp_path)
+    modules = [
+        name.removesuffix(".py").replace("/", ".")
+        for name in sorted(members(wheel))
+        if name.endswith(".py") and not name.endswith("__init__.py")
+    ]
+    paths = [str(tmp_path), sysconfig.get_path("purelib")]
+    script = (
+        f"import sys, importlib; sys.path[:0] = {paths!r}\n"
+        f"for name in {modules!r}:\n"
+        "    file = importlib.import_module(name).__file__\n"
+        f"    assert file.startswith({str(tmp_path)!r}), file\n"
+        "assert 'open3d' not in sys.modules\n"
+        "print('all imported')\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-S", "-c", script],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout == "all imported\n", done.stderr[-2000:]
+
+
+def locked():
+    """Return the requirement lines of the lock, hashes left out."""
+    text = (ROOT / "requirements.lock").read_text()
+    return [
+        Requirement(line) for line in re.findall(r"^(\S+==[^\\\n]+?) *\\?$", text, re.MULTILINE)
+    ]
+
+
+def test_the_lock_satisfies_the_project():
+    wanted = [*PROJECT["dependencies"]]
+    for extra in PROJECT["optional-dependencies"].values():
+        wanted += extra
+    pins = locked()
+    for requirement in map(Requirement, wanted):
+        own = [pin for pin in pins if pin.name.lower() == requirement.name.lower()]
+        assert own, f"{requirement} is not in the lock"
+        for pin in own:
+            (version,) = (specifier.version for specifier in pin.specifier)
+            assert requirement.specifier.contains(version), f"{requirement} but {pin}"
+    (opencv,) = (pin for pin in pins if pin.name == "opencv-python-headless")
+    assert str(opencv.specifier).startswith("==5.")
+
+
+def test_the_lock_has_hashes_and_no_address():
+    text = (ROOT / "requirements.lock").read_text()
+    assert "://" not in text
+    blocks = re.split(r"^(?=\S)", text, flags=re.MULTILINE)
+    pinned = [block for block in blocks if "==" in block.split("\n")[0]]
+    assert len(pinned) == len(locked())
+    assert all("--hash=sha256:" in block for block in pinned)
+
+
+def test_the_command_is_installed():
+    assert find_spec("groundfuse.tools.fuse_team") is not None
+    assert (Path(sysconfig.get_path("scripts")) / "fuse-team").exists()
