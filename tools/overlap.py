@@ -78,7 +78,7 @@ def counted_floor(view: View) -> Points:
         step * np.arange(math.ceil((at - reach) / step), math.floor((at + reach) / step) + 1)
         for at in (foot.x_m, foot.y_m)
     )
-    grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    grid: Points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2).astype(np.float64)
     return grid[in_view(view, grid)]
 
 

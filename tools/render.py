@@ -139,7 +139,7 @@ def _extent(corners: Points, attitude: Attitude, foot: Se2, rays: Picture32) -> 
     if (in_cam[:, 2] < 0.05 * attitude.height_m).any():
         return (0, rows, 0, columns)
     seen = in_cam[:, :2] / in_cam[:, 2:]
-    centre = rays[SUPER // 2 :: SUPER, SUPER // 2 :: SUPER]
+    centre = np.ascontiguousarray(rays[SUPER // 2 :: SUPER, SUPER // 2 :: SUPER])
     margin = 4.0 * float(np.abs(centre[0, 1] - centre[0, 0]).max())
     inside = ((centre >= seen.min(0) - margin) & (centre <= seen.max(0) + margin)).all(axis=2)
     if not inside.any():
