@@ -1,0 +1,124 @@
+"""What the pictures tell of the cameras and what they do not, in one line each; numpy only."""
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from groundfuse.backend.bundle_estimate import Estimated, Finding, FindingKind, MountEstimate
+from groundfuse.backend.bundle_priors import prior_residual
+from groundfuse.backend.bundle_setup import Team
+from groundfuse.backend.bundle_solve import Problem, Solution
+
+Array = NDArray[np.float64]
+
+FAR_OFF_SIGMA = 3.0
+"""A file's number further off than so many sigmas is worth a line."""
+WOBBLE_SHARE = 1.5
+"""A wobble that exceeds its sigma by this factor is worth a line."""
+NOISE_SHARE = 2.0
+"""So is a noise of the correspondences off by this factor, either way."""
+
+
+def findings_of(
+    team: Team,
+    problem: Problem,
+    solution: Solution,
+    mounts: tuple[MountEstimate, ...],
+    shared: Array,
+) -> tuple[Finding, ...]:
+    """List all statements; `shared` is the covariance of the robots' unknowns."""
+    return (
+        *_apart(team, problem),
+        *(finding for mount in mounts for finding in _mount(mount)),
+        *_relative_heights(team, problem, solution, shared),
+        *_wobble(team, problem, solution),
+        *_noise(team, solution),
+    )
+
+
+def scale_finding(robots: tuple[str, ...], scale_sigma: float) -> Finding:
+    """State what is known of the map's scale."""
+    text = f"absolute scale comes from the camera heights alone: sigma {100 * scale_sigma:.2g} %"
+    return Finding(FindingKind.SCALE, robots, scale_sigma, text)
+
+
+def _apart(team: Team, problem: Problem) -> Iterator[Finding]:
+    """Robots that never meet."""
+    groups = problem.priors.group_of
+    count = int(groups.max()) + 1
+    if count > 1:
+        parts = [
+            "+".join(name for name, g in zip(team.robots, groups, strict=True) if g == group)
+            for group in range(count)
+        ]
+        text = f"no overlap between {', '.join(parts)}: relative poses and heights are not told"
+        yield Finding(FindingKind.APART, team.robots, float(count), text)
+
+
+def _mount(mount: MountEstimate) -> Iterator[Finding]:
+    """One robot's calibration numbers."""
+    degree = 180.0 / math.pi
+    rows: tuple[tuple[str, Estimated | None, float, str], ...] = (
+        ("tilt", mount.tilt_rad, degree, "deg"),
+        ("roll", mount.roll_rad, degree, "deg"),
+        ("focal length", mount.focal, 100.0, "%"),
+        ("first distortion term", mount.distortion, 1.0, ""),
+    )
+    for name, found, unit, sign in rows:
+        if found is None:
+            continue
+        if found.value is None:
+            share = found.sigma / found.prior_sigma
+            text = (
+                f"{mount.robot}: {name} is not observable here (sigma {share:.0%} of the prior's)"
+            )
+            yield Finding(FindingKind.UNOBSERVABLE, (mount.robot,), share, text)
+        elif abs(found.value) > FAR_OFF_SIGMA * found.sigma:
+            text = (
+                f"{mount.robot}: {name} is off its file by {found.value * unit:+.3g} "
+                f"+- {found.sigma * unit:.2g} {sign}".rstrip()
+            )
+            yield Finding(FindingKind.CALIBRATION, (mount.robot,), found.value, text)
+
+
+def _relative_heights(
+    team: Team, problem: Problem, solution: Solution, shared: Array
+) -> Iterator[Finding]:
+    """Heights of robots against the first of their group."""
+    groups = problem.priors.group_of
+    for group in range(int(groups.max()) + 1):
+        members = np.flatnonzero(groups == group).tolist()
+        first = 6 * members[0] + 2
+        for index in members[1:]:
+            place = 6 * index + 2
+            value = float(solution.state.shared[index, 2] - solution.state.shared[members[0], 2])
+            variance = shared[first, first] + shared[place, place] - 2.0 * shared[first, place]
+            sigma = math.sqrt(max(variance, 0.0))
+            if abs(value) > FAR_OFF_SIGMA * sigma:
+                pair = (team.robots[members[0]], team.robots[index])
+                text = (
+                    f"{pair[1]}: height against {pair[0]}'s is off the files by "
+                    f"{100 * value:+.3g} +- {100 * sigma:.2g} %"
+                )
+                yield Finding(FindingKind.CALIBRATION, pair, value, text)
+
+
+def _wobble(team: Team, problem: Problem, solution: Solution) -> Iterator[Finding]:
+    """Frames that wander more than their sigmas say."""
+    residual = prior_residual(solution.state, problem.priors)
+    for index, robot in enumerate(team.robots):
+        mine = residual[problem.priors.robot_of == index]
+        spread = np.sqrt(np.mean(mine**2, axis=0))
+        for name, value in zip(("tilt", "roll", "height"), spread.tolist(), strict=True):
+            if value > WOBBLE_SHARE:
+                text = f"{robot}: the {name} wobbles {value:.1f} times as much as its sigma"
+                yield Finding(FindingKind.WOBBLE, (robot,), value, text)
+
+
+def _noise(team: Team, solution: Solution) -> Iterator[Finding]:
+    """Keypoints noisier or better than promised."""
+    if not 1.0 / NOISE_SHARE < solution.noise < NOISE_SHARE:
+        text = f"keypoint residuals are {solution.noise:.2g} times what their sigmas promise"
+        yield Finding(FindingKind.NOISE, team.robots, solution.noise, text)

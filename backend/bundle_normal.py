@@ -1,0 +1,232 @@
+"""Normal equations of the bundle with the floor points eliminated; numpy only.
+
+Nodes are frames (x, y, theta, tilt, roll, height) and, after them, robots (mount offsets of tilt,
+roll, height; focal length; distortion; a spare): 6 unknowns each. Residuals are whitened; with
+Q the orthonormal basis of what a floor point explains in its sightings, eliminating it takes
+Q'J out of J'J (Golub and Pereyra's variable projection, to first order the Schur complement).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from groundfuse.backend.bundle_cholesky import BLOCK
+from groundfuse.backend.bundle_model import State, derivatives, through_lens, view_of
+from groundfuse.backend.bundle_priors import Pattern, Priors
+from groundfuse.backend.bundle_tracks import Integers, Observations
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """Whitened derivatives of all sightings.
+
+    Attributes:
+        by_frame: (6, n, 2).
+        by_point: (2, n, 2).
+        by_lens: (2, n, 2); (2, 0, 2) where lenses are as filed.
+    """
+
+    by_frame: Array
+    by_point: Array
+    by_lens: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reduced:
+    """The system without floor points, and what brings them back.
+
+    Attributes:
+        rows: whitened derivatives.
+        basis: (2, n, 2) Q' of every sighting: orthonormal over the sightings of a point.
+        by_frame: (6, n, 2) Q'J of every sighting, by row of Q'.
+        by_lens: (points, 2, robots, 2) Q'K of every floor point; None where lenses are as filed.
+        root: (3, points) Cholesky factor l00, l10, l11 of every point's information.
+        blocks: (n, 6, 6) of the reduced system by the pattern.
+    """
+
+    rows: Rows
+    basis: Array
+    by_frame: Array
+    by_lens: Array | None
+    root: Array
+    blocks: Array
+
+
+def whitened_rows(seen: Observations, state: State, weight: Array, priors: Priors) -> Rows:
+    """Differentiate all sightings; `weight` (n,) is the kernel's over the variance."""
+    count, lens = len(seen.frame), bool(priors.free_lens.any())
+    by_frame, by_point = np.empty((BLOCK, count, 2)), np.empty((2, count, 2))
+    by_lens, root_weight = np.empty((2, count if lens else 0, 2)), np.sqrt(weight)[:, None]
+    for part in seen.parts:
+        view = view_of(seen, state, part)
+        found = derivatives(view)
+        robot = priors.robot_of[seen.frame[part]]
+        if lens or state.shared[:, 3:5].any():
+            found = through_lens(found, view, state.shared[robot])
+        if lens:
+            free = priors.free_lens[robot].T[:, :, None]
+            by_lens[:, part] = found.by_lens * root_weight[part] * free
+        by_frame[:, part] = found.by_frame * root_weight[part]
+        by_point[:, part] = found.by_point * root_weight[part]
+    for index in np.flatnonzero(priors.fixed).tolist():
+        by_frame[:3, seen.frame_start[index] : seen.frame_start[index + 1]] = 0.0
+    return Rows(by_frame, by_point, by_lens)
+
+
+def _by_points(values: Array, point: Integers, num_points: int) -> Array:
+    """Sum values (n, k) over the sightings of each point: (points, k)."""
+    sums = [np.bincount(point, column, num_points) for column in values.T]
+    return np.stack(sums, axis=1).astype(np.float64, copy=False)
+
+
+def _projected(basis: Array, derivative: Array) -> Array:
+    """Q'D of some sightings: (k, n, 2) from derivatives (k, n, 2)."""
+    result = np.empty_like(derivative)
+    for row in range(2):
+        x, y = basis[row, :, 0], basis[row, :, 1]
+        result[:, :, row] = x * derivative[:, :, 0] + y * derivative[:, :, 1]
+    return result
+
+
+def _root(by_point: Array, point: Integers, num_points: int) -> Array:
+    """Cholesky factor (3, points) of each point's information."""
+    tiny = np.finfo(np.float64).tiny
+
+    def total(i: int, j: int) -> Array:
+        product = by_point[i, :, 0] * by_point[j, :, 0] + by_point[i, :, 1] * by_point[j, :, 1]
+        return _by_points(product[:, None], point, num_points)[:, 0]
+
+    l00 = np.sqrt(np.maximum(total(0, 0), tiny))
+    l10 = total(0, 1) / l00
+    l11 = np.sqrt(np.maximum(total(1, 1) - l10 * l10, 1e-12 * l00 * l00 + tiny))
+    return np.stack([l00, l10, l11])
+
+
+def _basis(by_point: Array, root: Array) -> Array:
+    """Rows Q' (2, n, 2) of some sightings from the factors (3, n) of their points."""
+    basis = np.empty_like(by_point)
+    basis[0] = by_point[0] / root[0][:, None]
+    basis[1] = (by_point[1] - root[1][:, None] * basis[0]) / root[2][:, None]
+    return basis
+
+
+def reduce_rows(seen: Observations, rows: Rows, pattern: Pattern, priors: Priors) -> Reduced:
+    """Accumulate the sightings and eliminate their floor points."""
+    root = _root(rows.by_point, seen.point, seen.num_points)
+    basis, by_frame = np.empty_like(rows.by_point), np.empty_like(rows.by_frame)
+    lens_rows = np.empty_like(rows.by_lens)
+    for part in seen.parts:
+        basis[:, part] = _basis(rows.by_point[:, part], root[:, seen.point[part]])
+        by_frame[:, part] = _projected(basis[:, part], rows.by_frame[:, part])
+        if lens_rows.size:
+            lens_rows[:, part] = _projected(basis[:, part], rows.by_lens[:, part])
+    blocks = np.zeros((len(pattern.rows), BLOCK, BLOCK))
+    for frame, part in enumerate(frame_parts(seen)):
+        own, out = rows.by_frame[:, part].reshape(BLOCK, -1), by_frame[:, part].reshape(BLOCK, -1)
+        blocks[frame] = own @ own.T - out @ out.T
+    _add_pairs(seen, by_frame, pattern, blocks)
+    by_lens = _lens_by_points(seen, lens_rows, priors) if lens_rows.size else None
+    reduced = Reduced(rows, basis, by_frame, by_lens, root, blocks)
+    if by_lens is not None:
+        _add_lens(seen, reduced, by_lens, priors, pattern)
+    return reduced
+
+
+def frame_parts(seen: Observations) -> list[slice]:
+    """Sightings of each frame."""
+    bounds = seen.frame_start.tolist()
+    return list(map(slice, bounds[:-1], bounds[1:]))
+
+
+def right_side(
+    seen: Observations, reduced: Reduced, error: Array, priors: Priors
+) -> tuple[Array, Array]:
+    """Right-hand side (frames + robots, 6), and Q'e of every floor point (points, 2).
+
+    `error` (n, 2) is whitened; where weights have changed since the rows were, by the old root.
+    """
+    explained = np.empty_like(error)
+    for part in seen.parts:
+        explained[part] = _projected(reduced.basis[:, part], error[None, part])[0]
+    by_points = _by_points(explained, seen.point, seen.num_points)
+    right = np.zeros((priors.num_nodes, BLOCK))
+    lens = right[priors.num_frames :, 3:5]
+    for frame, part in enumerate(frame_parts(seen)):
+        own, out = reduced.rows.by_frame[:, part], reduced.by_frame[:, part]
+        right[frame] = own.reshape(BLOCK, -1) @ error[part].ravel()
+        right[frame] -= out.reshape(BLOCK, -1) @ by_points[seen.point[part]].ravel()
+        if reduced.by_lens is not None:
+            k = reduced.rows.by_lens[:, part].reshape(2, -1)
+            lens[priors.robot_of[frame]] += k @ error[part].ravel()
+    if reduced.by_lens is not None:
+        across = reduced.by_lens.reshape(-1, 2 * priors.num_robots)
+        lens -= (across.T @ by_points.ravel()).reshape(-1, 2)
+    return right, by_points
+
+
+def _add_pairs(seen: Observations, by_frame: Array, pattern: Pattern, blocks: Array) -> None:
+    """Add what frames have in common through the floor points they share."""
+    place, bounds = pattern.pair_at.tolist(), seen.pair_start.tolist()
+    for chunk in seen.pair_parts:
+        start = bounds[chunk.start]
+        inside = slice(start, bounds[chunk.stop])
+        first = np.take(by_frame, seen.pair_i[inside], axis=1)
+        second = np.take(by_frame, seen.pair_j[inside], axis=1)
+        for index in range(chunk.start, chunk.stop):
+            part = slice(bounds[index] - start, bounds[index + 1] - start)
+            a, b = first[:, part].reshape(BLOCK, -1), second[:, part].reshape(BLOCK, -1)
+            blocks[place[index]] = -(a @ b.T)
+
+
+def _lens_by_points(seen: Observations, lens_rows: Array, priors: Priors) -> Array:
+    """Q'K of every floor point, (points, 2, robots, 2): by row, robot, unknown."""
+    place = seen.point * priors.num_robots + priors.robot_of[seen.frame]
+    flat = lens_rows.transpose(1, 2, 0).reshape(-1, 4)
+    sums = _by_points(flat, place, seen.num_points * priors.num_robots)
+    split = sums.reshape(seen.num_points, priors.num_robots, 2, 2)
+    return np.ascontiguousarray(split.transpose(0, 2, 1, 3))
+
+
+def _add_lens(
+    seen: Observations, reduced: Reduced, by_lens: Array, priors: Priors, pattern: Pattern
+) -> None:
+    """Add the robots' focal lengths and distortions to the blocks, in place."""
+    num_frames, num_robots = priors.num_frames, priors.num_robots
+    across = by_lens.reshape(-1, 2 * num_robots)
+    total = -(across.T @ across).reshape(num_robots, 2, num_robots, 2)
+    border = reduced.blocks[pattern.border_at : pattern.shared_at].reshape(
+        num_frames, num_robots, BLOCK, BLOCK
+    )
+    for frame, part in enumerate(frame_parts(seen)):
+        robot = int(priors.robot_of[frame])
+        own = reduced.rows.by_frame[:, part].reshape(BLOCK, -1)
+        k = reduced.rows.by_lens[:, part].reshape(2, -1)
+        out = reduced.by_frame[:, part].reshape(BLOCK, -1)
+        taken = out @ by_lens[seen.point[part]].reshape(-1, 2 * num_robots)
+        border[frame, :, :, 3:5] -= taken.reshape(BLOCK, num_robots, 2).transpose(1, 0, 2)
+        border[frame, robot, :, 3:5] += own @ k.T
+        total[robot, :, robot, :] += k @ k.T
+    robots = np.arange(num_robots)
+    reduced.blocks[num_frames + robots, 3:5, 3:5] += total[robots, :, robots, :]
+    first, second = np.triu_indices(num_robots, 1)
+    at = pattern.shared_at + np.arange(len(first))
+    reduced.blocks[at, 3:5, 3:5] += total[first, :, second, :]
+
+
+def point_steps(
+    seen: Observations, reduced: Reduced, explained: Array, step: Array, priors: Priors
+) -> Array:
+    """Steps (points, 2) of the floor points that go with a step (frames + robots, 6)."""
+    change = np.empty((len(seen.frame), 2))
+    for frame, part in enumerate(frame_parts(seen)):
+        change[part] = np.tensordot(step[frame], reduced.by_frame[:, part], axes=1)
+    rest = explained - _by_points(change, seen.point, seen.num_points)
+    if reduced.by_lens is not None:
+        flat = reduced.by_lens.reshape(seen.num_points, 2, -1)
+        rest = rest - flat @ step[priors.num_frames :, 3:5].ravel()
+    l00, l10, l11 = reduced.root
+    y = rest[:, 1] / l11
+    return np.stack([(rest[:, 0] - l10 * y) / l00, y], axis=1)
