@@ -46,7 +46,7 @@ def trajectory_text(poses: Iterable[tuple[float, Se2]]) -> str:
     for time_s, pose in poses:
         half = pose.theta_rad / 2.0
         numbers = (time_s, pose.x_m, pose.y_m, 0.0, 0.0, 0.0, math.sin(half), math.cos(half))
-        lines.append(" ".join(f"{number:.17g}" for number in numbers))
+        lines.append(" ".join(map(repr, map(float, numbers))))
     return "\n".join(lines) + "\n"
 
 

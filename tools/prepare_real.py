@@ -1,0 +1,69 @@
+"""Make team folders of real photographs: `python tools/prepare_real.py --source ../shared/real`.
+
+- `seneca`: robots A and B, two passes of a drone over a field (72 and 88 pictures). `--priors` adds
+  GPS heights and GPS motion to the frame lists. Ground truth is a structure-from-motion reference,
+  there to score results; nothing else reads it.
+- `planar_mosaic`, `planar_floorplan`: robots A and B, three pictures each, straight down, exact
+  truth. `planar_mosaic_one`, `planar_floorplan_one`: the same six pictures of a single robot A.
+"""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from groundfuse.tools.errors import DataError, TeamError
+from groundfuse.tools.real_planar import HALVES, WHOLE, planar
+from groundfuse.tools.real_seneca import seneca
+from groundfuse.tools.real_team import RealRobot, write_team
+
+
+@dataclass(frozen=True, kw_only=True)
+class PrepareReal:
+    """Write real photographs as team folders."""
+
+    source: Path = Path("../shared/real")
+    """Folder that has `seneca/` and `planar_frames/`."""
+    out: Path = Path("out/real")
+    """Folder that gets one team folder each."""
+    priors: bool = False
+    """Write GPS heights and motion into Seneca's frame lists."""
+
+
+def teams(options: PrepareReal) -> dict[str, tuple[RealRobot, ...]]:
+    """Return the robots of every team by the team's name.
+
+    Raises:
+        DataError: the source isn't there.
+    """
+    flat = options.source / "planar_frames"
+    for folder in (options.source / "seneca", flat):
+        if not folder.is_dir():
+            raise DataError(f"{folder}: no such folder, needed real photographs (see --help)")
+    return {
+        "seneca": seneca(options.source / "seneca", priors=options.priors),
+        "planar_mosaic": planar(flat, "mosaic", HALVES),
+        "planar_mosaic_one": planar(flat, "mosaic", WHOLE),
+        "planar_floorplan": planar(flat, "floorplan", HALVES),
+        "planar_floorplan_one": planar(flat, "floorplan", WHOLE),
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns the exit code."""
+    options = tyro.cli(PrepareReal, args=arguments, description=__doc__)
+    try:
+        for name, robots in teams(options).items():
+            write_team(options.out / name, robots)
+            found = ", ".join(f"{robot.name} with {len(robot.frames)}" for robot in robots)
+            print(f"{options.out / name}: {found} pictures")
+    except TeamError as error:
+        print(f"prepare_real: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
