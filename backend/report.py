@@ -23,7 +23,7 @@ from groundfuse.backend.measurement import (
 )
 from groundfuse.backend.problem import Array, Indices, Problem, chi2_per_edge, components
 from groundfuse.backend.skeleton import Skeleton
-from groundfuse.backend.voting import Assignment, Vote
+from groundfuse.backend.voting import Vote
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,8 +51,17 @@ class Findings:
     verdict: Vote | None
 
 
-def estimate(order: Sequence[FrameId], found: Findings, limit: float) -> TeamEstimate:
-    """Return the border type; `limit` is the chi2 above which an edge was turned down."""
+def estimate(
+    order: Sequence[FrameId], found: Findings, is_step: Flags, limit: float
+) -> TeamEstimate:
+    """Return the border type.
+
+    Args:
+        order: the frames by number.
+        found: the solved graph.
+        is_step: (m,) edges that are steps of a trajectory, used or turned down.
+        limit: the chi2 above which an edge was turned down.
+    """
     kept = found.whole.of(found.accepted)
     part = components(kept)
     layout = layout_of(kept)
@@ -67,7 +76,7 @@ def estimate(order: Sequence[FrameId], found: Findings, limit: float) -> TeamEst
         component_of={f: int(rank[c]) for f, c in zip(order, part, strict=True)},
         covariance={f: covariance[k] for k, f in enumerate(order) if free[k]},
         anchors=_anchors(order, found, poses, covariance, rank[part]),
-        verdicts=_verdicts(order, found, error, limit),
+        verdicts=_verdicts(order, found, error, is_step, limit),
         chi2=float(error[found.accepted].sum()),
         degrees_of_freedom=3 * len(kept) - 3 * int(free.sum()),
         ambiguities=_ambiguities(order, found),
@@ -92,7 +101,7 @@ def _by_size(part: Indices) -> Indices:
 
 
 def _verdicts(
-    order: Sequence[FrameId], found: Findings, error: Array, limit: float
+    order: Sequence[FrameId], found: Findings, error: Array, is_step: Flags, limit: float
 ) -> tuple[EdgeVerdict, ...]:
     inner = found.maps.part[found.whole.a] == found.maps.part[found.whole.b]
     verdicts = []
@@ -107,7 +116,7 @@ def _verdicts(
                 accepted,
                 float(error[k]),
                 limit,
-                EdgeKind.CHAIN if found.on_chain[k] else kind,
+                EdgeKind.CHAIN if is_step[k] else kind,
                 None if accepted else reason,
             )
         )
@@ -174,27 +183,24 @@ def _ambiguities(order: Sequence[FrameId], found: Findings) -> tuple[Ambiguity, 
     team, best = found.team, found.verdict.best
     answers = [best, *found.verdict.rivals]
     withheld = best.agreeing & ~found.verdict.sure
-    _, first = np.unique(found.maps.part, return_index=True)
+    first = np.unique(found.maps.part, return_index=True)[1].tolist()
     result = []
     for f, g in np.unique(team.maps[withheld], axis=0).tolist():
-        pair = (team.maps == [f, g]).all(axis=1)
+        pair = (team.maps[:, 0] == f) & (team.maps[:, 1] == g)
         distinct: list[Answer] = []
         for assignment in answers:
-            support = int((assignment.agreeing & pair).sum())
-            if not support:
-                continue
-            pose = _place(found, team, assignment, pair)
-            a, b = order[first[f]], order[first[g]]
-            distinct.append(Answer(a, b, planar.pose(pose), support))
+            agreeing = np.flatnonzero(assignment.agreeing & pair)
+            if len(agreeing):
+                pose = _place(found, team, int(agreeing[0]))
+                answer = Answer(order[first[f]], order[first[g]], planar.pose(pose), len(agreeing))
+                distinct.append(answer)
         distinct.sort(key=lambda answer: -answer.support)
         result.append(Ambiguity(_without_repeats(distinct)))
     return tuple(result)
 
 
-def _place(found: Findings, team: Skeleton, assignment: Assignment, pair: Flags) -> Array:
-    """Return the first map's frame from the second's, as the first agreeing edge says."""
-    agreeing: Indices = np.flatnonzero(assignment.agreeing & pair)
-    k = int(agreeing[0])
+def _place(found: Findings, team: Skeleton, k: int) -> Array:
+    """Return the first map's frame from the second's, as overlap k says."""
     poses, joins = found.maps.poses, team.joins
     f_from_b = planar.compose(poses[team.node[joins.a[k]]], joins.a_from_b[k])
     return planar.compose(f_from_b, planar.inverse(poses[team.node[joins.b[k]]]))

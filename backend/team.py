@@ -5,16 +5,17 @@ frame of a component held at the origin. A robot's anchor is then the pose of it
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from itertools import pairwise
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from groundfuse.backend import chain, native, planar
 from groundfuse.backend import problem as graph
 from groundfuse.backend.consistency import Flags, against_chain, links
-from groundfuse.backend.initial import layout_of
+from groundfuse.backend.doubt import doubtful_steps
+from groundfuse.backend.initial import held_poses, layout_of
 from groundfuse.backend.measurement import FrameId, RelativePose, TeamEstimate
+from groundfuse.backend.numbering import Team, team_of
 from groundfuse.backend.problem import Array, Indices, Problem
 from groundfuse.backend.report import Findings, estimate
 from groundfuse.backend.robust import RobustOptions, settle
@@ -31,6 +32,9 @@ class TeamOptions:
             step over failed frames continues the chain, anything longer is a loop.
         voting: how overlaps between maps are weighed.
         robust: when an edge is turned down.
+        max_cuts: steps of trajectories that may be found wrong and cut.
+        max_trials: suspected steps tried before each of them.
+        step_trust: a step turned down costs as much as this many other edges.
         refine_below: graphs of fewer poses than this get their last iterations from gtsam's own
             Gauss-Newton on its own factors, as a second implementation of the same optimum.
     """
@@ -38,6 +42,9 @@ class TeamOptions:
     max_skip: int = 5
     voting: VotingOptions = field(default_factory=VotingOptions)
     robust: RobustOptions = field(default_factory=RobustOptions)
+    max_cuts: int = 10
+    max_trials: int = 12
+    step_trust: float = 3.0
     refine_below: int = 20_000
 
 
@@ -57,52 +64,78 @@ def fuse(
     Raises:
         ValueError: a frame is given twice, or an edge names a frame that was not given.
     """
-    order, whole = _numbered(frames, edges)
-    step = _is_step(order, whole, options.max_skip)
-    gap = np.abs(whole.b - whole.a).astype(float)
-    maps = chain.spanning_forest(whole.of(step), gap[step])
+    team = team_of(frames, edges, options.max_skip)
+    steps = team.is_step
+    found = _joined(team, steps, options, guess=True)
+    kind_of_step = found.on_chain
+    for _ in range(options.max_cuts):
+        better = _with_a_cut(team, steps, found, options)
+        if better is None:
+            break
+        found, steps = better
+    if found.verdict is not None and found.verdict.rivals:
+        found = _joined(team, steps, options, guess=False)
+    found = replace(found, poses=_refined(found, options))
+    return estimate(team.frames, found, kind_of_step, options.robust.limit)
+
+
+def _joined(team: Team, steps: Flags, options: TeamOptions, *, guess: bool) -> Findings:
+    """Chain the maps along `steps`, join them, and settle which edges belong.
+
+    With `guess`, maps that could lie in several ways are put where the best answer says; that is
+    for finding wrong steps only, since a wrong step looks like two answers.
+    """
+    whole = team.problem
+    maps = chain.spanning_forest(whole.of(steps), team.gap[steps])
+    number = np.append(np.flatnonzero(steps), -1)
+    maps = replace(maps, edge=number[maps.edge])
     on_chain = np.zeros(len(whole), dtype=bool)
-    on_chain[np.flatnonzero(step)[maps.edge[maps.edge >= 0]]] = True
+    on_chain[maps.edge[maps.edge >= 0]] = True
     inner = maps.part[whole.a] == maps.part[whole.b]
-    believed = on_chain.copy()
+    believed, undecided = on_chain.copy(), np.zeros(len(whole), dtype=bool)
     believed[inner] |= _fits(whole.of(inner), maps, options.robust.limit)
-    team = skeleton(_upwards(whole.of(~inner), maps.part), maps) if (~inner).any() else None
-    verdict = vote(team, options.voting) if team is not None else None
-    if verdict is not None:
-        believed[~inner] = verdict.sure
-    start = _start(whole, believed, on_chain, gap)
-    poses, accepted = _solved(whole, start, on_chain, believed, options)
-    undecided = np.zeros(len(whole), dtype=bool)
-    if verdict is not None:
+    meetings, verdict = None, None
+    if not inner.all():
+        meetings = skeleton(_upwards(whole.of(~inner), maps.part), maps)
+        verdict = vote(meetings, options.voting)
+        believed[~inner] = verdict.best.agreeing if guess else verdict.sure
         undecided[~inner] = _undecided(verdict)
-    found = Findings(whole, maps, poses, accepted, on_chain, undecided & ~accepted, team, verdict)
-    return estimate(order, found, options.robust.limit)
+    start = _start(whole, believed, on_chain, team.gap)
+    poses, accepted = _settled(whole, start, on_chain, believed, options)
+    open_edges = undecided & ~accepted
+    return Findings(whole, maps, poses, accepted, on_chain, open_edges, meetings, verdict)
 
 
-def _numbered(
-    frames: Sequence[FrameId], edges: Sequence[RelativePose]
-) -> tuple[list[FrameId], Problem]:
-    """Return the frames in order and the edges on their numbers."""
-    order = sorted(frames)
-    for one, two in pairwise(order):
-        if one == two:
-            raise ValueError(f"frame {one} is given twice")
-    index_of = {frame: k for k, frame in enumerate(order)}
-    for edge in edges:
-        for end in (edge.a, edge.b):
-            if end not in index_of:
-                raise ValueError(f"edge {edge.a}-{edge.b} names frame {end}, which was not given")
-    return order, graph.from_edges(index_of, edges)
+def _with_a_cut(
+    team: Team, steps: Flags, found: Findings, options: TeamOptions
+) -> tuple[Findings, Flags] | None:
+    """Return the best result with one step less, if it explains the edges better."""
+    limit = options.robust.limit
+    cuts = doubtful_steps(team.problem, found.maps, found.poses, found.accepted, limit)
+    best, lowest = None, _truncated(found, team.is_step, options) - limit
+    for cut in cuts[: options.max_trials]:
+        fewer = steps.copy()
+        fewer[cut.edge] = False
+        again = _joined(team, fewer, options, guess=True)
+        cost = _truncated(again, team.is_step, options)
+        if cost < lowest:
+            best, lowest = (again, fewer), cost
+    return best
 
 
-def _is_step(order: Sequence[FrameId], whole: Problem, max_skip: int) -> Flags:
-    """Return whether each edge may be a step of a trajectory."""
-    names = {name: k for k, name in enumerate(sorted({f.robot for f in order}))}
-    robot = np.array([names[f.robot] for f in order], dtype=np.int64)
-    index = np.array([f.index for f in order], dtype=np.int64)
-    a, b = whole.a, whole.b
-    near: Flags = (robot[a] == robot[b]) & (np.abs(index[a] - index[b]) <= max_skip)
-    return near
+def _truncated(found: Findings, is_step: Flags, options: TeamOptions) -> float:
+    """Return the cost of all edges, cut at the limit; steps at `step_trust` times the limit."""
+    most = np.where(is_step, options.step_trust, 1.0) * options.robust.limit
+    error = graph.chi2_per_edge(found.whole, found.poses)
+    return float(np.where(found.accepted, np.minimum(error, most), most).sum())
+
+
+def _refined(found: Findings, options: TeamOptions) -> Array:
+    """Let gtsam iterate on its own factors, where the graph is not too large."""
+    kept = found.whole.of(found.accepted)
+    if found.whole.num_poses >= options.refine_below or not len(kept):
+        return found.poses
+    return native.refined(kept, held_poses(kept), found.poses)
 
 
 def _fits(loops: Problem, maps: chain.Forest, limit: float) -> Flags:
@@ -130,7 +163,7 @@ def _start(whole: Problem, believed: Flags, on_chain: Flags, gap: Array) -> Arra
     return chain.spanning_forest(whole.of(believed), length[believed]).poses
 
 
-def _solved(
+def _settled(
     whole: Problem, start: Array, on_chain: Flags, believed: Flags, options: TeamOptions
 ) -> tuple[Array, Flags]:
     """Return the poses and the accepted edges."""
@@ -141,12 +174,7 @@ def _solved(
     result = settle(some, start, layout, on_chain[within], believed[within], options=options.robust)
     accepted = np.zeros(len(whole), dtype=bool)
     accepted[within] = result.accepted
-    kept = whole.of(accepted)
-    poses = result.poses
-    if whole.num_poses < options.refine_below and len(kept):
-        held = np.unique(graph.components(kept), return_index=True)[1].astype(np.int64)
-        poses = native.refined(kept, held, poses)
-    return poses, accepted
+    return result.poses, accepted
 
 
 def _undecided(verdict: Vote) -> Flags:
