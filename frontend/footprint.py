@@ -1,0 +1,77 @@
+"""Which floor a picture shows, and how finely: the lattice behind a mosaic's extent and cell."""
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+
+from groundfuse.backend.measurement import Attitude, Se2
+from groundfuse.frontend.area_remap import singular_values
+from groundfuse.frontend.arrays import Floats, Points
+from groundfuse.frontend.camera import Camera
+from groundfuse.frontend.overhead import floor_from_rays
+
+LATTICE_COLUMNS = 33
+LATTICE_ROWS = 49
+BEYOND = 1.5
+"""A lattice point past the limit still counts for the extent when its neighbour is within it and
+it is at most this many times too coarse: the limit itself lies between the two."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Footprint:
+    """The floor under a lattice of pixels over the used rows.
+
+    Attributes:
+        floor_m: (LATTICE_ROWS, LATTICE_COLUMNS, 2) in the team's frame; nan above the horizon.
+        m_per_px: (LATTICE_ROWS, LATTICE_COLUMNS) length of one pixel on the floor, the longer way.
+    """
+
+    floor_m: Floats
+    m_per_px: Floats
+
+    def finest_m_per_px(self, share: float) -> float:
+        """Return the length that this share of the picture's pixels stays below."""
+        return float(np.nanquantile(self.m_per_px, share))
+
+    def bounds(self, limit_m: float) -> tuple[Points, Points] | None:
+        """Return the lowest and highest (x, y) of the floor resolved within the limit, or None."""
+        with np.errstate(invalid="ignore"):
+            useful = self.m_per_px <= limit_m
+            near = self.m_per_px <= limit_m * BEYOND
+        if not useful.any():
+            return None
+        padded = np.pad(useful, 1)
+        rows, columns = useful.shape
+        for row in range(3):
+            for column in range(3):
+                useful = useful | (near & padded[row : row + rows, column : column + columns])
+        floor = self.floor_m[useful]
+        return floor.min(axis=0), floor.max(axis=0)
+
+
+@functools.lru_cache(maxsize=64)
+def _lattice(camera: Camera) -> tuple[Points, Floats, Floats]:
+    """Rays (n, 2) of a camera's lattice, and its rows and columns in pixels."""
+    first, last = camera.used_rows
+    u = np.linspace(0.0, camera.intrinsics.width_px - 1.0, LATTICE_COLUMNS)
+    v = np.linspace(first, last, LATTICE_ROWS)
+    px = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    return camera.intrinsics.rays_from_px(px), v, u
+
+
+def widest_ray(camera: Camera) -> float:
+    """Return the length of a camera's widest ray; wider ones can fold back into the picture."""
+    rays, _, _ = _lattice(camera)
+    return float(np.nanmax(np.hypot(rays[:, 0], rays[:, 1])))
+
+
+def footprint(camera: Camera, attitude: Attitude, team_from_foot: Se2) -> Footprint:
+    """Return the floor that a picture shows."""
+    rays, v, u = _lattice(camera)
+    floor = floor_from_rays(attitude, rays)
+    lattice = floor.reshape(len(v), len(u), 2)
+    by_v = np.asarray(np.gradient(lattice, v, axis=0), dtype=np.float64)
+    by_u = np.asarray(np.gradient(lattice, u, axis=1), dtype=np.float64)
+    longest, _ = singular_values(by_u, by_v)
+    return Footprint(team_from_foot.apply(floor).reshape(lattice.shape), longest)
