@@ -4,12 +4,11 @@ Every texture is a function of a seed and a rectangle of cells. Sizes are in cel
 cell of 0.75 mm a view from 0.55 m is meant; other heights scale the cell (`floor`).
 """
 
-import difflib
-
 import cv2
 import numpy as np
 
 from groundfuse.frontend.arrays import Floats, Image, Picture32
+from groundfuse.tools.checks import nearest
 from groundfuse.tools.chips import SUBPIXEL_BITS, ChipLayer, draw_chips
 from groundfuse.tools.floor_raster import FloorRaster, Texture
 from groundfuse.tools.noise import Rect, octaves, smooth, uniform, white
@@ -51,7 +50,7 @@ def gravel(seed: int, rect: Rect) -> Image:
     """Pebbles on sand, lit from one side."""
     sand = 92.0 + octaves((seed, 1), rect, {64: 6.0, 6: 8.0, 2: 10.0, 1: 9.0})
     base = _finished(sand[..., None] * np.array([0.78, 0.9, 1.0], dtype=np.float32))
-    palette = tuple((b + 12, g + 10, r + 6) for b, g, r in (*_GREYS[:4], *_WARM))
+    palette = tuple((0.8 * b + 12, 0.8 * g + 10, 0.8 * r + 6) for b, g, r in (*_GREYS[:4], *_WARM))
     for index, layer in enumerate(
         (
             ChipLayer(pitch=8, smallest=1.5, largest=3.6, share=0.9, corners=9, relief=0.30),
@@ -210,7 +209,6 @@ def make_floor(name: str, seed: int, height_m: float = 0.55) -> FloorRaster:
         ValueError: no floor has this name; the height is not positive.
     """
     if name not in FLOORS:
-        near = difflib.get_close_matches(name, FLOORS, n=1, cutoff=0.0)
-        known = ", ".join(FLOORS)
-        raise ValueError(f"no floor is called {name!r} (nearest: {near[0]!r}); known: {known}")
+        hint = nearest(name, FLOORS) or f" (known: {', '.join(FLOORS)})"
+        raise ValueError(f"no floor is called {name!r}{hint}")
     return FloorRaster(FLOORS[name], seed, CELL_PER_HEIGHT * height_m)

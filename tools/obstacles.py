@@ -2,6 +2,7 @@
 
 import functools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,7 @@ LIGHT = np.array([0.8, 0.6])
 DARKEST_SIDE = 0.45
 TEXTURE_CELLS = 511
 CELLS_PER_SIZE = 160.0
+TINY = 1e-12
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,43 +92,50 @@ def _surface(obstacle: Obstacle, u_m: Floats, v_m: Floats, face: Floats) -> Floa
     return factor
 
 
-def _box(obstacle: Obstacle, origin: Floats, rays: Floats) -> tuple[Floats, Floats, Floats]:
-    """Distance, outward normal (n, 2; zero on top) and face index (n,) in the box's frame."""
-    half = np.array([obstacle.half_x_m, obstacle.half_y_m, obstacle.height_m / 2.0])
-    centred = origin - np.array([0.0, 0.0, half[2]])
-    safe = np.where(np.abs(rays) < 1e-12, 1e-12, rays)
-    near = (-np.sign(safe) * half - centred) / safe
-    far = (np.sign(safe) * half - centred) / safe
-    axis = near.argmax(axis=1)
-    enter = near.max(axis=1)
-    hit = (enter < far.min(axis=1)) & (enter > 0.0)
-    normal = np.zeros((len(rays), 2))
-    for k in (0, 1):
-        normal[axis == k, k] = -np.sign(safe[axis == k, k])
-    return np.where(hit, enter, np.inf), normal, axis.astype(np.float64)
+Solved = tuple[Floats, Floats, Floats, Floats]
+"""Distance, outward normal x and y (both 0 on top) and number of the face, each (n,)."""
 
 
-def _cylinder(obstacle: Obstacle, origin: Floats, rays: Floats) -> tuple[Floats, Floats, Floats]:
-    """Distance, outward normal (n, 2; zero on top) and face index (n,) in its frame."""
-    a = np.maximum((rays[:, :2] ** 2).sum(axis=1), 1e-18)
-    b = rays[:, :2] @ origin[:2]
-    c = float(origin[:2] @ origin[:2]) - obstacle.half_x_m**2
-    inside = b * b - a * c
-    side = np.where(inside > 0.0, (-b - np.sqrt(np.maximum(inside, 0.0))) / a, np.inf)
-    level = origin[2] + np.where(np.isfinite(side), side, 0.0) * rays[:, 2]
-    side = np.where((side > 0.0) & (level >= 0.0) & (level <= obstacle.height_m), side, np.inf)
-    down = np.where(rays[:, 2] < 0.0, rays[:, 2], np.nan)
-    top = (obstacle.height_m - origin[2]) / down
-    reach = np.hypot(origin[0] + top * rays[:, 0], origin[1] + top * rays[:, 1])
-    top = np.where((top > 0.0) & (reach <= obstacle.half_x_m), top, np.inf)
-    is_top = top < side
-    along = np.minimum(top, side)
-    met = origin[:2] + np.where(np.isfinite(along), along, 0.0)[:, None] * rays[:, :2]
-    normal = np.where(is_top[:, None], 0.0, met / obstacle.half_x_m)
-    return along, normal, np.where(is_top, 2.0, 0.0)
+def _box(obstacle: Obstacle, origin: Floats, rays: Sequence[Floats]) -> Solved:
+    half = (obstacle.half_x_m, obstacle.half_y_m, obstacle.height_m / 2.0)
+    centre = (origin[0], origin[1], origin[2] - half[2])
+    near, far = [], []
+    for ray, size, at in zip(rays, half, centre, strict=True):
+        steep = np.where(np.abs(ray) < TINY, TINY, ray)
+        middle, spread = -at / steep, size / np.abs(steep)
+        near.append(middle - spread)
+        far.append(middle + spread)
+    enter = np.maximum(np.maximum(near[0], near[1]), near[2])
+    leave = np.minimum(np.minimum(far[0], far[1]), far[2])
+    face = np.where(enter == near[0], 0.0, np.where(enter == near[1], 1.0, 2.0))
+    normal_x = np.where(face == 0.0, -np.sign(rays[0]), 0.0)
+    normal_y = np.where(face == 1.0, -np.sign(rays[1]), 0.0)
+    along = np.where((enter < leave) & (enter > 0.0), enter, np.inf)
+    return along, normal_x, normal_y, face
 
 
-def meet(obstacle: Obstacle, origin_m: Floats, rays: Floats) -> Hit:
+def _cylinder(obstacle: Obstacle, origin: Floats, rays: Sequence[Floats]) -> Solved:
+    radius, top_m = obstacle.half_x_m, obstacle.height_m
+    x, y, z = rays
+    a = np.maximum(x * x + y * y, TINY * TINY)
+    b = x * origin[0] + y * origin[1]
+    inside = b * b - a * (origin[0] ** 2 + origin[1] ** 2 - radius**2)
+    side = (-b - np.sqrt(np.maximum(inside, 0.0))) / a
+    level = origin[2] + side * z
+    on_side = (inside > 0.0) & (side > 0.0) & (level >= 0.0) & (level <= top_m)
+    top = (top_m - origin[2]) / np.where(np.abs(z) < TINY, TINY, z)
+    top_x, top_y = origin[0] + top * x, origin[1] + top * y
+    on_top = (top > 0.0) & (top_x * top_x + top_y * top_y <= radius * radius)
+    side, top = np.where(on_side, side, np.inf), np.where(on_top, top, np.inf)
+    face = np.where(top < side, 2.0, 0.0)
+    reach = np.where(on_side & (face == 0.0), side, 0.0) / radius
+    flat = on_side & (face == 0.0)
+    normal_x = np.where(flat, origin[0] / radius + reach * x, 0.0)
+    normal_y = np.where(flat, origin[1] / radius + reach * y, 0.0)
+    return np.minimum(top, side), normal_x, normal_y, face
+
+
+def meet(obstacle: Obstacle, origin_m: Floats, rays: Picture32) -> Hit:
     """Meet rays with a solid.
 
     Args:
@@ -135,22 +144,34 @@ def meet(obstacle: Obstacle, origin_m: Floats, rays: Floats) -> Hit:
         rays: (n, 3) directions in the world, any length; `Hit.along` counts in that length.
     """
     solid_from_world = obstacle.world_from_solid.inverse()
-    turn = Se2(0.0, 0.0, solid_from_world.theta_rad)
+    angle = solid_from_world.theta_rad
+    c, s = math.cos(angle), math.sin(angle)
     origin = np.append(solid_from_world.apply(origin_m[None, :2])[0], origin_m[2])
-    local = np.column_stack([turn.apply(rays[:, :2]), rays[:, 2]])
-    shape = _cylinder if obstacle.is_round else _box
-    along, normal, face = shape(obstacle, origin, local)
-    hit = np.isfinite(along)
-    met, normal = origin + along[hit, None] * local[hit], normal[hit]
-    on_top = ~normal.any(axis=1)
-    around = met[:, 0] * normal[:, 1] - met[:, 1] * normal[:, 0]
-    if obstacle.is_round:
-        around = np.arctan2(met[:, 1], met[:, 0]) * obstacle.half_x_m
-    u, v = np.where(on_top, met[:, 0], around), np.where(on_top, met[:, 1], met[:, 2])
-    shade = 1.0 - (1.0 - DARKEST_SIDE) * (~on_top) * (
-        0.75 - 0.25 * (turn.inverse().apply(normal) @ LIGHT)
+    x, y, z = (rays[:, k].astype(np.float64) for k in range(3))
+    local = (c * x - s * y, s * x + c * y, z)
+    along, normal_x, normal_y, face = (_cylinder if obstacle.is_round else _box)(
+        obstacle, origin, local
     )
-    bright = shade * _surface(obstacle, u, v, face[hit])
+    hit = np.flatnonzero(np.isfinite(along))
     colour = np.zeros((len(rays), 3), dtype=np.float32)
-    colour[hit] = np.clip(bright[:, None] * np.array(obstacle.colour), 0.0, 255.0)
+    met = [o + along[hit] * axis[hit] for o, axis in zip(origin, local, strict=True)]
+    shine = _shine(obstacle, met, (normal_x[hit], normal_y[hit]), face[hit])
+    colour[hit] = np.clip(shine[:, None] * np.array(obstacle.colour), 0.0, 255.0)
     return Hit(along, colour)
+
+
+def _shine(
+    obstacle: Obstacle, met: Sequence[Floats], normal: tuple[Floats, Floats], face: Floats
+) -> Floats:
+    """Brightness factor (n,) of met points, in the solid's frame: light from one side, texture."""
+    on_top = face == 2.0
+    if obstacle.is_round:
+        around = np.arctan2(met[1], met[0]) * obstacle.half_x_m
+    else:
+        around = met[0] * normal[1] - met[1] * normal[0]
+    u, v = np.where(on_top, met[0], around), np.where(on_top, met[1], met[2])
+    light = Se2(0.0, 0.0, -obstacle.world_from_solid.theta_rad).apply(LIGHT[None, :])[0]
+    facing = normal[0] * light[0] + normal[1] * light[1]
+    side = 1.0 - (1.0 - DARKEST_SIDE) * (0.75 - 0.25 * facing)
+    factor: Floats = np.where(on_top, 1.0, side) * _surface(obstacle, u, v, face)
+    return factor

@@ -5,12 +5,14 @@ the foot, as if nothing stood on it. It is counted on a grid that is fixed to th
 """
 
 import functools
+import itertools
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from groundfuse.backend.measurement import Attitude, Se2
+from groundfuse.backend.measurement import Attitude, FrameId, Se2
 from groundfuse.frontend.arrays import Mask, Points
 from groundfuse.frontend.camera import Camera
 from groundfuse.frontend.overhead import rays_from_floor
@@ -100,6 +102,19 @@ def true_overlap(a: View, b: View) -> float:
     smaller = min(_area_m2(a), _area_m2(b))
     if smaller == 0.0:
         return 0.0
+    if _are_apart(counted_floor(lower), counted_floor(higher)):
+        return 0.0
     step = STEP_PER_HEIGHT * lower.attitude.height_m
     shared = np.count_nonzero(in_view(higher, counted_floor(lower))) * step**2
     return min(1.0, float(shared) / smaller)
+
+
+def _are_apart(a_m: Points, b_m: Points) -> bool:
+    """Whether the boxes around two sets of points have a gap between them."""
+    return bool((a_m.min(0) > b_m.max(0)).any() or (b_m.min(0) > a_m.max(0)).any())
+
+
+def all_overlaps(views: Mapping[FrameId, View]) -> dict[tuple[FrameId, FrameId], float]:
+    """Return the overlap of every pair of views that has any, each pair once, in order."""
+    found = {(a, b): true_overlap(views[a], views[b]) for a, b in itertools.combinations(views, 2)}
+    return {pair: share for pair, share in found.items() if share > 0.0}

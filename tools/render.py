@@ -167,7 +167,7 @@ def _draw_obstacles(
             continue
         part = rays[r0 * SUPER : r1 * SUPER, c0 * SUPER : c1 * SUPER]
         direction = _directions(part, attitude, foot.theta_rad)
-        hit = meet(obstacle, origin, direction.reshape(-1, 3).astype(np.float64))
+        hit = meet(obstacle, origin, direction.reshape(-1, 3))
         met = np.isfinite(hit.along).astype(np.float32).reshape(part.shape[:2])
         colour = hit.colour.reshape(*part.shape[:2], 3) * met[..., None]
         share = _squares(met)[..., None]

@@ -3,9 +3,8 @@
 Shared by the tests, the benches and `render_team.py`. Everything follows from the seed alone.
 """
 
-import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,12 +14,13 @@ from groundfuse.frontend.arrays import Image
 from groundfuse.frontend.camera import Camera
 from groundfuse.tools.floors import make_floor
 from groundfuse.tools.obstacles import Obstacle
-from groundfuse.tools.overlap import View, counted_floor, true_overlap
+from groundfuse.tools.overlap import View, all_overlaps, counted_floor, true_overlap
 from groundfuse.tools.photometry import Photometry, photograph
 from groundfuse.tools.render import World, render_view
 
 FREE_PER_HEIGHT = 0.35  # no obstacle stands nearer to a camera's foot, in camera heights
 OBSTACLE_TRIES = 400
+WOBBLE, SOLIDS, LIGHT = range(3)  # independent streams of chance from one seed
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,9 +96,7 @@ class RenderedTeam:
 
     def overlaps(self) -> dict[tuple[FrameId, FrameId], float]:
         """Return the overlap of every pair that has any."""
-        pairs = itertools.combinations(self.frames, 2)
-        found = {(a.id, b.id): true_overlap(a.view, b.view) for a, b in pairs}
-        return {pair: share for pair, share in found.items() if share > 0.0}
+        return all_overlaps({frame.id: frame.view for frame in self.frames})
 
 
 def wobbled(camera: Camera, rng: np.random.Generator) -> Attitude:
@@ -153,6 +151,65 @@ def _random_solid(spot: np.ndarray, height_m: float, rng: np.random.Generator) -
     return Obstacle(pose, radius, float(half_y), float(tall), colour, is_round, seed)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """A world and where every picture of it is taken, before any is taken.
+
+    Attributes:
+        world: floor and obstacles.
+        robots: who takes pictures.
+        views: the true views of each robot, in order.
+        seed: all chance follows from it.
+    """
+
+    world: World
+    robots: tuple[RobotSpec, ...]
+    views: tuple[tuple[View, ...], ...]
+    seed: int
+
+    def by_frame(self) -> dict[FrameId, View]:
+        """Return every view by the picture's name, robot after robot."""
+        return {
+            FrameId(robot.name, index): view
+            for robot, views in zip(self.robots, self.views, strict=True)
+            for index, view in enumerate(views)
+        }
+
+
+def set_scene(floor: str, seed: int, robots: Sequence[RobotSpec], num_obstacles: int = 0) -> Scene:
+    """Lay a floor whose grain suits the lowest camera, stand solids on it, and wobble the cameras.
+
+    Raises:
+        ValueError: no robot, or an unknown floor.
+    """
+    if not robots:
+        raise ValueError("a team needs at least one robot, got none")
+    lowest = min(robot.camera.mount.attitude.height_m for robot in robots)
+    raster = make_floor(floor, seed, lowest)
+    views = []
+    for index, robot in enumerate(robots):
+        rng = np.random.default_rng([seed, WOBBLE, index])
+        views.append(
+            tuple(View(robot.camera, wobbled(robot.camera, rng), p) for p in robot.world_from_base)
+        )
+    every = [view for of_robot in views for view in of_robot]
+    rng = np.random.default_rng([seed, SOLIDS])
+    solids = place_obstacles(every, num_obstacles, lowest, rng)
+    return Scene(World(raster, solids), tuple(robots), tuple(views), seed)
+
+
+def photographs(scene: Scene, photometry: Photometry) -> Iterator[RenderedFrame]:
+    """Take the pictures one by one, robot after robot; each is the same whatever came before.
+
+    Raises:
+        ValueError: a lens that has no ray for a pixel.
+    """
+    numbers = {robot.name: k for k, robot in enumerate(scene.robots)}
+    for frame, view in scene.by_frame().items():
+        rng = np.random.default_rng([scene.seed, LIGHT, numbers[frame.robot], frame.index])
+        yield RenderedFrame(frame, take(scene.world, view, photometry, rng), view)
+
+
 def make_team(
     floor: str,
     seed: int,
@@ -160,43 +217,20 @@ def make_team(
     photometry: Photometry | None = None,
     num_obstacles: int = 0,
 ) -> RenderedTeam:
-    """Photograph one floor with a team.
-
-    The floor's grain suits the lowest camera. Wobble, obstacles and photometry come from `seed`.
+    """Photograph one floor with a team: `set_scene`, then all `photographs`.
 
     Raises:
-        ValueError: no robot; an unknown floor; a camera whose lens has no ray for a pixel.
+        ValueError: no robot; an unknown floor; a lens that has no ray for a pixel.
     """
-    if not robots:
-        raise ValueError("a team needs at least one robot, got none")
-    heights = [robot.camera.mount.attitude.height_m for robot in robots]
-    chance = np.random.default_rng(seed).spawn(len(robots) + 1)
-    views = [
-        [View(robot.camera, wobbled(robot.camera, rng), pose) for pose in robot.world_from_base]
-        for robot, rng in zip(robots, chance, strict=False)
-    ]
-    every_view = [view for of_robot in views for view in of_robot]
-    solids = place_obstacles(every_view, num_obstacles, min(heights), chance[-1])
-    world = World(make_floor(floor, seed, min(heights)), solids)
+    scene = set_scene(floor, seed, robots, num_obstacles)
+    frames = tuple(photographs(scene, photometry or Photometry()))
     rendered = [
-        _photographed(world, robot, of_robot, photometry or Photometry(), rng)
-        for robot, of_robot, rng in zip(robots, views, chance, strict=False)
+        RenderedRobot(
+            robot.name, robot.camera, tuple(f for f in frames if f.id.robot == robot.name)
+        )
+        for robot in robots
     ]
-    return RenderedTeam(tuple(rendered), solids)
-
-
-def _photographed(
-    world: World,
-    robot: RobotSpec,
-    views: Sequence[View],
-    photometry: Photometry,
-    rng: np.random.Generator,
-) -> RenderedRobot:
-    frames = [
-        RenderedFrame(FrameId(robot.name, index), take(world, view, photometry, rng), view)
-        for index, view in enumerate(views)
-    ]
-    return RenderedRobot(robot.name, robot.camera, tuple(frames))
+    return RenderedTeam(tuple(rendered), scene.world.obstacles)
 
 
 def take(world: World, view: View, photometry: Photometry, rng: np.random.Generator) -> Image:
