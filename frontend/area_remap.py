@@ -49,7 +49,8 @@ def area_plan(source_px: Floats, wanted: Mask) -> AreaPlan:
     level, samples = _level_and_factor(source_px, wanted)
     maps = np.nan_to_num(source_px / 2.0**level, nan=OUTSIDE_PX).astype(np.float32)
     fine = cv2.resize(maps, None, fx=samples, fy=samples, interpolation=cv2.INTER_LINEAR)
-    map_u, map_v = cv2.split(fine[samples:-samples, samples:-samples])
+    inner = np.asarray(fine, dtype=np.float32)[samples:-samples, samples:-samples]
+    map_u, map_v = (np.ascontiguousarray(inner[..., axis]) for axis in (0, 1))
     return AreaPlan(level, samples, map_u, map_v)
 
 

@@ -1,10 +1,10 @@
 """The motion most candidate matches agree on, and how far ahead of the runner-up it is.
 
-Floor coordinates of two views differ by an isometry (paper §2) as far as the cameras are steady; the
-consensus therefore draws two candidates, compares their segment lengths, and lets every candidate
-vote. Candidates are the k nearest neighbours *without* ratio test: on a floor that repeats, the
-neighbours spread over the repeats and the second-best motion gets nearly as many votes as the best,
-which no count of inliers would show (architecture.md, front-end 5).
+Floor coordinates of two views differ by an isometry (paper §2) as far as the cameras are steady;
+the consensus therefore draws two candidates, compares their segment lengths, and lets every
+candidate vote. Candidates are the k nearest neighbours *without* ratio test: on a floor that
+repeats, the neighbours spread over the repeats and the second-best motion gets nearly as many votes
+as the best, which no count of inliers would show.
 """
 
 from dataclasses import dataclass
@@ -248,7 +248,9 @@ def _procrustes(a: Points, b: Points, max_log_scale: float) -> Floats:
         return np.array([1.0, 0.0, *(mean_a - mean_b)])
     scale = 1.0
     if max_log_scale > 0.0:
-        scale = float(np.clip(length / (db**2).sum(), np.exp(-max_log_scale), np.exp(max_log_scale)))
+        scale = float(
+            np.clip(length / (db**2).sum(), np.exp(-max_log_scale), np.exp(max_log_scale))
+        )
     c, s = scale * c / length, scale * s / length
     shift = mean_a - np.array([c * mean_b[0] - s * mean_b[1], s * mean_b[0] + c * mean_b[1]])
     return np.array([c, s, *shift])
@@ -275,9 +277,7 @@ def _distinct(
     return apart | (turn > options.distinct_turn_rad)
 
 
-def one_to_one(
-    found: Candidates, motion: Floats, tolerance_m: float, max_turn_rad: float
-) -> Mask:
+def one_to_one(found: Candidates, motion: Floats, tolerance_m: float, max_turn_rad: float) -> Mask:
     """Return the nearest voter of each feature of a, then of each feature of b."""
     squared = _residual(found, motion[None])[0]
     near = np.flatnonzero(_near(found, motion[None], tolerance_m, max_turn_rad)[0])

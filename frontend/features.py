@@ -22,7 +22,6 @@ from groundfuse.frontend.overhead_view import (
     overhead_grid,
     overhead_view,
 )
-
 from groundfuse.frontend.repetition import repetition
 
 
@@ -135,22 +134,22 @@ def _found(
     """Detect, spread over the floor, describe."""
     inner = cv2.erode(mask.astype(np.uint8), np.ones((9, 9), np.uint8), borderValue=0)
     if options.kind == "orb":
-        orb = cv2.ORB_create(nfeatures=4 * wanted + 1, fastThreshold=10, nlevels=4)
+        orb = cv2.ORB.create(nfeatures=4 * wanted + 1, fastThreshold=10, nlevels=4)
         kept = _spread(list(orb.detect(flat, inner)), wanted, options.cell_px)
-        kept, bits = orb.compute(flat, kept)
-        return list(kept), np.zeros((0, 32), np.uint8) if bits is None else bits
-    sift = cv2.SIFT_create(
+        found, bits = orb.compute(flat, kept)
+        return list(found), np.zeros((0, 32), np.uint8) if bits is None else bits
+    sift = cv2.SIFT.create(
         nfeatures=0,
         contrastThreshold=options.contrast_threshold,
         edgeThreshold=10,
         enable_precise_upscale=True,
     )
     kept = _spread(list(sift.detect(flat, inner)), wanted, options.cell_px)
-    kept, described = sift.compute(flat, kept)
+    found, described = sift.compute(flat, kept)
     if described is None:
         return [], np.zeros((0, 128), np.float32)
     root = np.sqrt(described / np.maximum(described.sum(axis=1, keepdims=True), 1e-9))
-    return list(kept), root.astype(np.float32)
+    return list(found), root.astype(np.float32)
 
 
 def _spread(keypoints: list[cv2.KeyPoint], wanted: int, cell_px: int) -> list[cv2.KeyPoint]:
@@ -186,7 +185,7 @@ def _sigma(
 def _wobble(
     attitude: Attitude, sigma: Attitude, floor: Points, rays: Points
 ) -> tuple[float, float, float]:
-    """Root mean square motion of floor points by wobble: after isometry, after similarity, scale."""
+    """Root mean square floor motion by wobble: after isometry, after similarity; log scale."""
     if len(floor) < 3:
         return 0.0, 0.0, 0.0
     rigid = stretched = log_scale = 0.0

@@ -3,8 +3,8 @@
 Nine parameters: x, y, theta of foot b in foot a, and tilt, roll, height of both cameras with the
 mount's wobble as prior. Residuals are transfer errors in the image of b, whitened with weights that
 are fixed before the fit: weights on the floor that depend on the parameters would make the fit
-shrink the height (architecture.md, front-end 1). Reference: iteratively reweighted Gauss-Newton with
-Cauchy weights and an annealed scale, then a gate and plain least squares over the gate's inliers.
+shrink the height. Method: iteratively reweighted Gauss-Newton with Cauchy weights and an annealed
+scale, then a gate and plain least squares over the gate's inliers.
 """
 
 from dataclasses import dataclass
@@ -98,8 +98,7 @@ def _whitening(points: Correspondences, by_rays_a: Floats) -> Floats:
     spread = by_rays_a @ by_rays_a.transpose(0, 2, 1) * (points.sigma_a**2)[:, None, None]
     spread += np.eye(2) * (points.sigma_b**2)[:, None, None]
     spread = np.where(np.isfinite(spread), spread, np.eye(2))
-    whitening: Floats = np.linalg.inv(np.linalg.cholesky(spread))
-    return whitening
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(spread)), dtype=np.float64)
 
 
 def fit_pair(
@@ -185,7 +184,7 @@ def _step(
     gradient = np.einsum("nik,ni->k", weighted, residual)
     hessian[3:, 3:] += np.diag(information)
     gradient[3:] -= information * pull
-    # The motion alone can be singular (one point); a prior far wider than any floor keeps it solvable.
+    # The motion alone can be singular (one point): a prior wider than any floor keeps it solvable.
     scale = np.trace(hessian[:3, :3]) * 1e-15 + 1e-12
     hessian[:3, :3] += np.eye(3) * scale
     return hessian, -np.linalg.solve(hessian, gradient)

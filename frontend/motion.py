@@ -1,6 +1,8 @@
-"""From a matcher's correspondences to a measured motion of the robot's base, or the reason why not."""
+"""From a matcher's correspondences to a measured motion of the robot's base, or why not."""
 
 from dataclasses import dataclass, field
+
+import numpy as np
 
 from groundfuse.backend.measurement import (
     Correspondences,
@@ -10,9 +12,10 @@ from groundfuse.backend.measurement import (
     RelativePose,
     Se2,
 )
-from groundfuse.frontend.arrays import Mask
+from groundfuse.frontend.arrays import Floats, Mask
 from groundfuse.frontend.fit import FitOptions, PairFit, Prior, fit_pair
 from groundfuse.frontend.matches import Matches, Miss
+from groundfuse.frontend.photometric import GreyView, PhotometricOptions, align
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -21,6 +24,9 @@ class MotionOptions:
 
     Attributes:
         fit: the fit itself.
+        photometric: the photometric stage, for views that bring their pictures.
+        max_photometric_chi2: the photometric motion is kept where it lies within this squared
+            distance of the features' motion, both uncertainties counted; 3 dof.
         min_inliers: fewest correspondences after the fit's gate.
         max_ambiguity: largest ratio of the second-best motion's votes to the best one's.
         max_noise: largest residual noise, as a multiple of the detector's model.
@@ -30,6 +36,8 @@ class MotionOptions:
     """
 
     fit: FitOptions = field(default_factory=FitOptions)
+    photometric: PhotometricOptions = field(default_factory=PhotometricOptions)
+    max_photometric_chi2: float = 25.0
     min_inliers: int = 12
     max_ambiguity: float = 0.6
     max_noise: float = 4.0
@@ -45,11 +53,13 @@ class View:
         id: the frame.
         prior: attitude of its camera.
         base_from_foot: place of the camera's foot on the robot.
+        grey: the picture, where the photometric stage is wanted.
     """
 
     id: FrameId
     prior: Prior
     base_from_foot: Se2
+    grey: GreyView | None = None
 
 
 def selected(points: Correspondences, keep: Mask, noise: float) -> Correspondences:
@@ -93,14 +103,31 @@ def _judged(
     for reason, value, limit in checks:
         if not value <= limit:
             return Rejected(a.id, b.id, reason, abs(value), abs(limit))
+    motion, spread = _aligned(a, b, fit, options)
     lever = b.base_from_foot.adjoint()
-    covariance = lever @ fit.covariance @ lever.T
+    covariance = lever @ spread @ lever.T
     return RelativePose(
         a.id,
         b.id,
-        a.base_from_foot @ fit.a_from_b @ b.base_from_foot.inverse(),
+        a.base_from_foot @ motion @ b.base_from_foot.inverse(),
         (covariance + covariance.T) / 2.0,
         num_inliers,
         found.ambiguity,
         selected(found.correspondences, fit.inliers, fit.noise),
     )
+
+
+def _aligned(a: View, b: View, fit: PairFit, options: MotionOptions) -> tuple[Se2, Floats]:
+    """The photometric motion where it is wanted, well-founded and near; else the features'."""
+    from_features = fit.a_from_b, fit.covariance
+    if a.grey is None or b.grey is None:
+        return from_features
+    attitudes = fit.attitude_a, fit.attitude_b
+    found = align(a.grey, b.grey, fit.a_from_b, a.prior, b.prior, attitudes, options.photometric)
+    if found is None or found.residual > options.photometric.max_residual:
+        return from_features
+    change = (fit.a_from_b.inverse() @ found.a_from_b).vector()
+    chi2 = float(change @ np.linalg.solve(fit.covariance + found.covariance, change))
+    if chi2 > options.max_photometric_chi2:
+        return from_features
+    return found.a_from_b, found.covariance

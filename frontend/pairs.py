@@ -1,5 +1,6 @@
 """Which pairs of frames to compare: neighbours in time, skips over failures, retrieved frames."""
 
+import itertools
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -26,7 +27,7 @@ class PairOptions:
 def neighbour_pairs(frames: Sequence[FrameId]) -> list[Pair]:
     """Return consecutive frames of each robot."""
     order = sorted(frames)
-    return [(a, b) for a, b in zip(order, order[1:], strict=False) if a.robot == b.robot]
+    return [(a, b) for a, b in itertools.pairwise(order) if a.robot == b.robot]
 
 
 def retrieved_pairs(features: Mapping[FrameId, Features], options: PairOptions) -> list[Pair]:
@@ -36,9 +37,7 @@ def retrieved_pairs(features: Mapping[FrameId, Features], options: PairOptions) 
     return [(order[i], order[j]) for i, j in found]
 
 
-def skip_pairs(
-    frames: Sequence[FrameId], joined: Collection[Pair], skip: int
-) -> list[Pair]:
+def skip_pairs(frames: Sequence[FrameId], joined: Collection[Pair], skip: int) -> list[Pair]:
     """Return pairs `skip` frames apart that would bridge a place where the chain is cut.
 
     The chain is cut between two consecutive frames if no accepted pair of the robot spans the gap.
@@ -51,7 +50,7 @@ def skip_pairs(
     by_robot: dict[str, list[FrameId]] = {}
     for frame in sorted(frames):
         by_robot.setdefault(frame.robot, []).append(frame)
-    wanted: list[Pair] = []
+    wanted: set[Pair] = set()
     for order in by_robot.values():
         place = {frame: k for k, frame in enumerate(order)}
         spanned = [False] * len(order)
@@ -59,7 +58,9 @@ def skip_pairs(
             if a in place and b in place:
                 first, last = sorted((place[a], place[b]))
                 spanned[first:last] = [True] * (last - first)
-        for start in range(len(order) - skip):
-            if not all(spanned[start : start + skip]):
-                wanted.append((order[start], order[start + skip]))
-    return [pair for pair in wanted if pair not in joined]
+        wanted.update(
+            (order[start], order[start + skip])
+            for start in range(len(order) - skip)
+            if not all(spanned[start : start + skip])
+        )
+    return sorted(wanted.difference(joined))

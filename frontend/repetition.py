@@ -39,7 +39,9 @@ def repetition(normalised: Picture32, mask: Mask) -> float:
     norm = np.sqrt(np.maximum(power * power[::-1, ::-1], 0.0))
     overlap = fftconvolve(weight, weight[::-1, ::-1])
     rows, columns = product.shape
-    away = np.hypot(*np.ogrid[-(rows // 2) : rows - rows // 2, -(columns // 2) : columns - columns // 2])
+    away = np.hypot(
+        *np.ogrid[-(rows // 2) : rows - rows // 2, -(columns // 2) : columns - columns // 2]
+    )
     counted = (overlap > MIN_OVERLAP * weight.sum()) & (away > MAIN_LOBE_SHARE * max(size))
     counted &= norm > 1e-6 * max(float(norm.max()), 1e-12)
     if not counted.any():

@@ -1,12 +1,13 @@
 """The default matcher: nearest neighbours of overhead features, and the motion most agree on."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import cv2
 import numpy as np
 
 from groundfuse.backend.measurement import Correspondences, Reason
-from groundfuse.frontend.arrays import Floats, Mask, Points
+from groundfuse.frontend.arrays import Picture32
 from groundfuse.frontend.consensus import (
     Candidates,
     ConsensusOptions,
@@ -115,19 +116,19 @@ def candidates(a: Features, b: Features, options: MatchOptions) -> Candidates:
     alike = np.abs(a.log_size[index_a] - b.log_size[index_b]) < options.max_log_size
     index_a, index_b, rank = index_a[alike], index_b[alike], rank[alike]
     turn_rad = a.angle_rad[index_a] - b.angle_rad[index_b]
-    return Candidates(
-        a.floor_m[index_a], b.floor_m[index_b], index_a, index_b, rank, turn_rad
-    )
+    return Candidates(a.floor_m[index_a], b.floor_m[index_b], index_a, index_b, rank, turn_rad)
 
 
-def _distances(a: Features, b: Features) -> Floats:
-    if a.descriptors.dtype == np.uint8:
-        distances: Floats = cv2.batchDistance(
-            a.descriptors, b.descriptors, dtype=cv2.CV_32S, normType=cv2.NORM_HAMMING
-        )[0]
-        return distances
-    products: Floats = a.descriptors @ b.descriptors.T
-    return -products
+def _distances(a: Features, b: Features) -> Picture32:
+    """Squared Euclidean or twice the Hamming distances, up to a constant."""
+    return -(_signed(a.descriptors) @ _signed(b.descriptors).T)
+
+
+def _signed(descriptors: np.ndarray[Any, Any]) -> Picture32:
+    """Bits as -1 and 1; anything else as it is."""
+    if descriptors.dtype == np.uint8:
+        return np.unpackbits(descriptors, axis=1).astype(np.float32) * 2.0 - 1.0
+    return descriptors
 
 
 def correspondences(

@@ -1,0 +1,175 @@
+"""Fuse the photographs of a team of robots into one map: `fuse_team.py --robots A B`."""
+
+import argparse
+import logging
+import os
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+# Threads work on frames and pairs; a second layer of them inside numpy would only get in the way.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import cv2
+from tqdm import tqdm
+
+from groundfuse.frontend.mosaic import MosaicOptions
+from groundfuse.tools.closing_table import closing_table
+from groundfuse.tools.drift_table import drift_record
+from groundfuse.tools.errors import TeamError
+from groundfuse.tools.files import make_folder, write_atomic
+from groundfuse.tools.front_end import Matcher, Result
+from groundfuse.tools.outputs import (
+    write_graphs,
+    write_json,
+    write_pairs,
+    write_poses,
+    write_trajectories,
+)
+from groundfuse.tools.pictures import write_mosaics
+from groundfuse.tools.pipeline import (
+    Fused,
+    PipelineOptions,
+    Stopwatch,
+    fuse_robots,
+)
+from groundfuse.tools.settings import record, with_settings
+from groundfuse.tools.team_folder import list_robots, read_team
+
+SAMPLE = Path(__file__).resolve().parent.parent / "data" / "team"
+EPILOG = """\
+examples:
+  fuse_team.py --robots A B                          the sample team that ships with the project
+  fuse_team.py --team my_team --out my_map           all robots of a folder
+  fuse_team.py --robots A --matcher paper            one robot, the paper's matcher
+  fuse_team.py --robots A B --set front_end.motion.max_ambiguity=0.5
+
+a team folder holds a folder per robot: images/, camera.yaml and, if you have them,
+frames.csv (times, attitudes, odometry) and groundtruth.tum (for scoring only).
+"""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunOptions:
+    """What a run is asked for; written to the out folder as options.json.
+
+    Attributes:
+        pipeline: pictures to poses.
+        mosaic: poses to a picture of the floor.
+    """
+
+    pipeline: PipelineOptions = field(default_factory=PipelineOptions)
+    mosaic: MosaicOptions = field(default_factory=MosaicOptions)
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the command line."""
+    command = argparse.ArgumentParser(
+        prog="fuse_team.py",
+        description="Fuse the photographs of a team of ground robots into one metric floor map.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = command.add_argument
+    add("--robots", nargs="+", metavar="NAME", help="robots to fuse (default: all in the folder)")
+    add("--team", type=Path, default=SAMPLE, metavar="FOLDER", help="team folder (the sample)")
+    add("--out", type=Path, default=Path("out"), metavar="FOLDER", help="results (out)")
+    add(
+        "--matcher",
+        choices=[str(m.value) for m in Matcher],
+        default="sift",
+        help="sift: the default; fast: ORB and photometric stage; paper: the published method",
+    )
+    cores = os.cpu_count() or 1
+    add("--workers", type=int, default=cores, metavar="N", help="threads (all cores)")
+    add("--no-bundle", action="store_true", help="stop at the Pose2 graph")
+    add("--no-mosaic", action="store_true", help="leave out mosaic, location graph and 3D file")
+    add("--cell", type=float, metavar="METRES", help="side of a mosaic cell (from the pictures)")
+    add("--check", action="store_true", help="second opinion: optimise the graph with Open3D too")
+    add("--view", action="store_true", help="show the map in an Open3D window at the end")
+    add(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="any option, by its name in options.json",
+    )
+    add("--quiet", action="store_true", help="no progress bars")
+    return command
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; 0 where a map was made, 2 where the input does not allow one."""
+    asked = parser().parse_args(arguments)
+    logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.INFO)
+    cv2.setNumThreads(1)
+    try:
+        run(asked)
+    except TeamError as error:
+        print(f"fuse_team: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def run(asked: argparse.Namespace) -> Fused:
+    """Do what the command line asks for."""
+    options = _options(asked)
+    if asked.workers < 1:
+        raise TeamError(f"--workers must be at least 1, got {asked.workers}")
+    watch = Stopwatch()
+    with watch.stage("reading"):
+        robots = read_team(asked.team, asked.robots or list_robots(asked.team))
+        out = make_folder(asked.out)
+        write_json(out / "options.json", record(options))
+    bar = _Bar(asked.quiet)
+    fused = fuse_robots(
+        robots, options.pipeline, asked.workers, bar, watch, bundled=not asked.no_bundle
+    )
+    drift = drift_record(fused)
+    with watch.stage("writing"):
+        write_pairs(out, fused)
+        write_poses(out, fused)
+        write_graphs(out, fused)
+        write_trajectories(out, fused)
+        write_json(out / "drift.json", drift)
+    notes: list[str] = []
+    if not asked.no_mosaic:
+        write_mosaics(out, fused, options.mosaic, asked.workers, watch, quiet=asked.quiet)
+    table = closing_table(fused, drift, watch.seconds)
+    table += "".join(f"{note}\n" for note in notes)
+    write_atomic(out / "report.txt", table)
+    print(table, end="")
+    print(f"everything is in {out}")
+    return fused
+
+
+def _options(asked: argparse.Namespace) -> RunOptions:
+    base = RunOptions()
+    front_end = base.pipeline.front_end
+    chosen = replace(front_end, matcher=Matcher(asked.matcher))
+    if chosen.matcher is Matcher.FAST:
+        chosen = replace(chosen, features=replace(front_end.features, kind="orb"), photometric=True)
+    options = replace(base, pipeline=replace(base.pipeline, front_end=chosen))
+    if asked.cell is not None:
+        options = with_settings(options, [f"mosaic.m_per_px={asked.cell}"])
+    short = [s if s.startswith("mosaic.") else f"pipeline.{s}" for s in asked.set]
+    return with_settings(options, short)
+
+
+class _Bar:
+    """Progress bars on the terminal."""
+
+    def __init__(self, quiet: bool) -> None:  # noqa: FBT001
+        self._quiet = quiet
+
+    def __call__(self, items: Iterable[Result], total: int, title: str) -> Iterable[Result]:
+        bar: Iterable[Result] = tqdm(
+            items, total=total, desc=f"{title:<10}", disable=self._quiet, leave=False
+        )
+        return bar
+
+
+if __name__ == "__main__":
+    sys.exit(main())

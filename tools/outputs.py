@@ -1,0 +1,156 @@
+"""What the main job leaves in the out folder, apart from pictures."""
+
+import csv
+import io
+import json
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from groundfuse.backend import g2o
+from groundfuse.backend.measurement import (
+    FrameId,
+    Rejected,
+    RelativePose,
+    Se2,
+    TeamEstimate,
+)
+from groundfuse.backend.trajectory import tum_text
+from groundfuse.tools.files import write_atomic
+from groundfuse.tools.pipeline import Fused, accepted_edges, turned_down
+
+SIGMAS = ("sigma_x_m", "sigma_y_m", "sigma_theta_deg")
+POSE = ("x_m", "y_m", "theta_deg", *SIGMAS)
+VERDICT = ("a", "b", "verdict", "reason", "value", "limit")
+PAIR_COLUMNS = (*VERDICT, *POSE, "inliers", "ambiguity", "chi2")
+POSE_COLUMNS = ("robot", "index", "image", "component", *POSE)
+
+
+def csv_text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """Return CSV text with every digit of every number."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows([[_word(value) for value in row] for row in rows])
+    return stream.getvalue()
+
+
+def _word(value: object) -> str:
+    if value is None:
+        return ""
+    return repr(float(value)) if isinstance(value, float) else str(value)
+
+
+def write_pairs(out: Path, fused: Fused) -> None:
+    """Write pairs.csv: every pair that was tried, with its verdict and its numbers."""
+    down = {(r.a, r.b): r for r in turned_down(fused.team)}
+    chi2 = {(v.a, v.b): v.chi2 for v in fused.team.verdicts}
+    rows = [_accepted_row(e, down.get((e.a, e.b)), chi2) for e in fused.front_end.edges]
+    rows += [_rejected_row(r) for r in fused.front_end.rejected]
+    write_atomic(out / "pairs.csv", csv_text(PAIR_COLUMNS, sorted(rows, key=_pair_order)))
+
+
+def _pair_order(row: Sequence[Any]) -> tuple[FrameId, FrameId]:
+    return row[0], row[1]
+
+
+def _accepted_row(
+    edge: RelativePose, down: Rejected | None, chi2: dict[tuple[FrameId, FrameId], float]
+) -> list[Any]:
+    z, c = edge.a_from_b, edge.covariance
+    verdict: list[Any] = ["used", None, None, None]
+    if down is not None:
+        verdict = ["turned_down", down.reason.value, down.value, down.limit]
+    sigma = [math.sqrt(c[0, 0]), math.sqrt(c[1, 1]), math.degrees(math.sqrt(c[2, 2]))]
+    pose = [z.x_m, z.y_m, math.degrees(z.theta_rad)]
+    found = [edge.num_inliers, edge.ambiguity, chi2.get((edge.a, edge.b))]
+    return [edge.a, edge.b, *verdict, *pose, *sigma, *found]
+
+
+def _rejected_row(rejected: Rejected) -> list[Any]:
+    reason = [rejected.reason.value, float(rejected.value), float(rejected.limit)]
+    return [rejected.a, rejected.b, "rejected", *reason, *[None] * 9]
+
+
+def write_graphs(out: Path, fused: Fused) -> None:
+    """Write each robot's own optimised graph, and the team's: one g2o file per component."""
+    for name, alone in fused.alone.items():
+        inner = [e for e in fused.edges if e.a.robot == e.b.robot == name]
+        _write_components(out, name, alone.optimised, accepted_edges(alone.optimised, inner))
+    _write_components(out, "team", fused.best, accepted_edges(fused.team, fused.edges))
+
+
+def _write_components(
+    out: Path, name: str, estimate: TeamEstimate, edges: Sequence[RelativePose]
+) -> None:
+    for component in sorted(set(estimate.component_of.values())):
+        poses = _component(estimate, component)
+        stem = component_name(name, component)
+        write_atomic(out / f"{stem}.g2o", g2o.text_of(g2o.numbered(poses, edges)))
+        write_atomic(out / f"{stem}.ids.json", g2o.ids_text(poses))
+
+
+def component_name(name: str, component: int) -> str:
+    """Return the stem of a component's files: the largest has no number."""
+    return name if component == 0 else f"{name}_{component}"
+
+
+def _component(estimate: TeamEstimate, component: int) -> dict[FrameId, Se2]:
+    return {
+        frame: pose
+        for frame, pose in estimate.team_from_base.items()
+        if estimate.component_of[frame] == component
+    }
+
+
+def write_trajectories(out: Path, fused: Fused) -> None:
+    """Write TUM files: every robot in the team frame, chained in its own, and the true one."""
+    best = fused.best
+    for robot in fused.robots:
+        time_s = {frame.id: frame.time_s for frame in robot.frames}
+
+        def stamped(poses: dict[FrameId, Se2], times: dict[FrameId, float] = time_s) -> str:
+            return tum_text((times[f], poses[f]) for f in sorted(poses) if f in times)
+
+        for component in sorted({best.component_of[frame] for frame in time_s}):
+            stem = component_name(robot.name, component)
+            write_atomic(out / f"{stem}.tum", stamped(_component(best, component)))
+        alone = fused.alone[robot.name]
+        for fragment in sorted(set(alone.fragment_of.values())):
+            poses = {f: p for f, p in alone.chained.items() if alone.fragment_of[f] == fragment}
+            stem = component_name(f"{robot.name}_chained", fragment)
+            write_atomic(out / f"{stem}.tum", stamped(poses))
+        if robot.truth:
+            write_atomic(out / f"{robot.name}_groundtruth.tum", stamped(robot.truth))
+
+
+def write_poses(out: Path, fused: Fused) -> None:
+    """Write poses.csv: every frame in its component's frame, with standard deviations."""
+    best, frames = fused.best, fused.frames
+    rows: list[list[Any]] = []
+    for frame, pose in sorted(best.team_from_base.items()):
+        covariance = best.covariance.get(frame)
+        sigma: list[float | None] = [None] * 3
+        if covariance is not None:
+            xy = covariance[0, 0], covariance[1, 1]
+            sigma = [*map(math.sqrt, xy), math.degrees(math.sqrt(covariance[2, 2]))]
+        where = [pose.x_m, pose.y_m, math.degrees(pose.theta_rad)]
+        image = frames[frame][1].path.name
+        rows.append([frame.robot, frame.index, image, best.component_of[frame], *where, *sigma])
+    write_atomic(out / "poses.csv", csv_text(POSE_COLUMNS, rows))
+
+
+def write_json(path: Path, content: object) -> None:
+    """Write JSON that a person can read; infinity becomes null."""
+    write_atomic(path, json.dumps(_finite(content), indent=2) + "\n")
+
+
+def _finite(content: object) -> object:
+    if isinstance(content, dict):
+        return {str(key): _finite(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_finite(value) for value in content]
+    if isinstance(content, float) and not math.isfinite(content):
+        return None
+    return content

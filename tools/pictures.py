@@ -1,0 +1,89 @@
+"""Pictures of the fused team: mosaics with world files, their layers, the location graph, 3D."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from tqdm import tqdm
+
+from groundfuse.backend.measurement import FrameId
+from groundfuse.frontend.arrays import Image
+from groundfuse.frontend.mosaic import Mosaic, MosaicOptions, MosaicView, build_mosaic
+from groundfuse.tools.errors import TeamError
+from groundfuse.tools.files import write_atomic
+from groundfuse.tools.outputs import component_name
+from groundfuse.tools.pipeline import Fused, Stopwatch
+from groundfuse.tools.team_folder import load_image
+
+COUNT_GREY = 16
+"""Grey values per view in the picture of the count of views."""
+
+
+def write_mosaics(
+    out: Path,
+    fused: Fused,
+    options: MosaicOptions,
+    num_workers: int,
+    watch: Stopwatch,
+    *,
+    quiet: bool,
+) -> dict[int, Mosaic]:
+    """Build and write the mosaic of every component with its layers; return them by component."""
+    mosaics: dict[int, Mosaic] = {}
+    for component in sorted(set(fused.best.component_of.values())):
+        with watch.stage("mosaic"), tqdm(desc="mosaic    ", disable=quiet, leave=False) as bar:
+
+            def told(done: int, total: int, bar: tqdm = bar) -> None:
+                bar.total = total
+                bar.update(done - bar.n)
+
+            views = _views(fused, component)
+            try:
+                mosaic = build_mosaic(views, replace(options, workers=num_workers), told)
+            except ValueError as error:
+                raise TeamError(f"mosaic of component {component}: {error}") from error
+        with watch.stage("writing"):
+            _write_layers(out, component_name("mosaic", component), mosaic)
+        mosaics[component] = mosaic
+    return mosaics
+
+
+def _views(fused: Fused, component: int) -> list[MosaicView]:
+    best, frames = fused.best, fused.frames
+
+    def loader(frame: FrameId) -> Callable[[], Image]:
+        robot, known = frames[frame]
+        return lambda: load_image(known, robot.camera)
+
+    return [
+        MosaicView(frame, frames[frame][0].camera, fused.attitude(frame), pose, loader(frame))
+        for frame, pose in sorted(best.team_from_base.items())
+        if best.component_of[frame] == component
+    ]
+
+
+def _write_layers(out: Path, stem: str, mosaic: Mosaic) -> None:
+    count = np.minimum(mosaic.count.astype(np.int64) * COUNT_GREY, 255).astype(np.uint8)
+    uncertain = np.where(mosaic.uncertain, 255, 0).astype(np.uint8)
+    layers = (("", mosaic.floor), ("_mean", mosaic.mean), ("_count", count), ("_few", uncertain))
+    for suffix, picture in layers:
+        write_png(out / f"{stem}{suffix}.png", picture)
+        write_atomic(out / f"{stem}{suffix}.pgw", world_file(mosaic))
+
+
+def world_file(mosaic: Mosaic) -> str:
+    """Return a world file: the affine map from columns and rows to metres in the team's frame."""
+    x_m = mosaic.x_min_m + mosaic.m_per_px / 2.0
+    y_m = mosaic.y_max_m - mosaic.m_per_px / 2.0
+    numbers = (mosaic.m_per_px, 0.0, 0.0, -mosaic.m_per_px, x_m, y_m)
+    return "".join(f"{number!r}\n" for number in numbers)
+
+
+def write_png(path: Path, picture: np.ndarray) -> None:
+    """Write a picture of 8 bits."""
+    encoded, data = cv2.imencode(".png", picture)
+    if not encoded:
+        raise TeamError(f"{path}: the picture could not be encoded")
+    write_atomic(path, data.tobytes())

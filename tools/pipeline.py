@@ -1,0 +1,170 @@
+"""The main job, stage by stage: pictures, pairs, robots' graphs, the team, the planar bundle."""
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from groundfuse.backend.bundle import bundle
+from groundfuse.backend.bundle_estimate import (
+    BundleCamera,
+    BundleEstimate,
+    BundleOptions,
+    BundleRefusal,
+)
+from groundfuse.backend.graph import RobotEstimate, robot_estimate
+from groundfuse.backend.measurement import (
+    Attitude,
+    FrameId,
+    Rejected,
+    RelativePose,
+    TeamEstimate,
+)
+from groundfuse.backend.team import TeamOptions, fuse
+from groundfuse.frontend.repetition import REPEATS
+from groundfuse.tools.front_end import FrontEndOptions, FrontEndResult, Progress, run_front_end
+from groundfuse.tools.robot import Frame, Robot
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PipelineOptions:
+    """Options of the main job, stage by stage.
+
+    Attributes:
+        front_end: pictures to relative poses.
+        team: relative poses to one map.
+        bundle: attitudes, mounts and poses from all correspondences at once.
+    """
+
+    front_end: FrontEndOptions = field(default_factory=FrontEndOptions)
+    team: TeamOptions = field(default_factory=TeamOptions)
+    bundle: BundleOptions = field(default_factory=BundleOptions)
+
+
+@dataclass(slots=True)
+class Stopwatch:
+    """Seconds per stage, in the order in which the stages ran."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Add the time of the block to a stage."""
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fused:
+    """Everything the main job found.
+
+    Attributes:
+        robots: the input.
+        front_end: edges, rejected pairs, features.
+        edges: the edges that the graphs were given: the front-end's and odometry's.
+        alone: every robot by itself: chained and optimised.
+        team: the Pose2 graph of the team.
+        bundled: the planar bundle, its refusal, or None where it was not asked for.
+    """
+
+    robots: tuple[Robot, ...]
+    front_end: FrontEndResult
+    edges: tuple[RelativePose, ...]
+    alone: dict[str, RobotEstimate]
+    team: TeamEstimate
+    bundled: BundleEstimate | BundleRefusal | None
+
+    @property
+    def best(self) -> TeamEstimate:
+        """The bundled team where there is one, else the Pose2 graph's."""
+        return self.bundled.team if isinstance(self.bundled, BundleEstimate) else self.team
+
+    @property
+    def frames(self) -> dict[FrameId, tuple[Robot, Frame]]:
+        """All frames with their robots."""
+        return {frame.id: (robot, frame) for robot in self.robots for frame in robot.frames}
+
+    def attitude(self, frame: FrameId) -> Attitude:
+        """Return the best known attitude of a frame."""
+        if isinstance(self.bundled, BundleEstimate) and frame in self.bundled.attitude:
+            return self.bundled.attitude[frame]
+        return self.frames[frame][1].attitude
+
+    @property
+    def repeating(self) -> list[FrameId]:
+        """Frames whose floor repeats itself."""
+        features = self.front_end.features
+        return [frame for frame in sorted(features) if features[frame].repetition > REPEATS]
+
+
+def fuse_robots(
+    robots: Sequence[Robot],
+    options: PipelineOptions,
+    num_workers: int,
+    progress: Progress,
+    watch: Stopwatch,
+    *,
+    bundled: bool = True,
+) -> Fused:
+    """Run the stages from pictures to the fused team."""
+    found = run_front_end(robots, options.front_end, num_workers, progress, watch.stage)
+    edges = (*found.edges, *odometry_edges(robots))
+    frames = [frame.id for robot in robots for frame in robot.frames]
+    with watch.stage("graphs"):
+        alone = {r.name: robot_estimate(r.name, frames, edges, options.team) for r in robots}
+        team = fuse(frames, edges, options.team)
+    refined: BundleEstimate | BundleRefusal | None = None
+    if bundled:
+        with watch.stage("bundle"):
+            refined = _bundled(robots, team, edges, options.bundle)
+    return Fused(tuple(robots), found, edges, alone, team, refined)
+
+
+def odometry_edges(robots: Sequence[Robot]) -> tuple[RelativePose, ...]:
+    """Return the motion between consecutive frames that both have odometry."""
+    edges = []
+    for robot in robots:
+        for a, b in zip(robot.frames, robot.frames[1:], strict=False):
+            if a.odometry is None or b.odometry is None:
+                continue
+            motion = a.odometry.map_from_base.inverse() @ b.odometry.map_from_base
+            covariance = np.diag(b.odometry.sigma.vector() ** 2)
+            edges.append(RelativePose(a.id, b.id, motion, covariance))
+    return tuple(edges)
+
+
+def accepted_edges(team: TeamEstimate, edges: Sequence[RelativePose]) -> list[RelativePose]:
+    """Return the edges that took part in the solution."""
+    return [e for e, v in zip(edges, team.verdicts, strict=True) if v.accepted]
+
+
+def turned_down(team: TeamEstimate) -> list[Rejected]:
+    """Return the edges that the team graph turned down, as values."""
+    return [
+        Rejected(v.a, v.b, v.reason, v.chi2, v.limit)
+        for v in team.verdicts
+        if not v.accepted and v.reason is not None
+    ]
+
+
+def _bundled(
+    robots: Sequence[Robot],
+    team: TeamEstimate,
+    edges: Sequence[RelativePose],
+    options: BundleOptions,
+) -> BundleEstimate | BundleRefusal:
+    frames = [frame for robot in robots for frame in robot.frames]
+    prior: Mapping[FrameId, Attitude] = {frame.id: frame.attitude for frame in frames}
+    sigma: Mapping[FrameId, Attitude] = {frame.id: frame.sigma for frame in frames}
+    cameras = {
+        robot.name: BundleCamera(
+            robot.camera.mount.base_from_foot, robot.camera.intrinsics.focal_px
+        )
+        for robot in robots
+    }
+    return bundle(team, accepted_edges(team, edges), prior, sigma, cameras, options)
