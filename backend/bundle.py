@@ -64,7 +64,7 @@ class Job:
     options: BundleOptions
 
 
-def bundle(  # noqa: PLR0917  each is an input of its own
+def bundle(
     start: TeamEstimate,
     edges: Sequence[RelativePose],
     prior: Mapping[FrameId, Attitude],

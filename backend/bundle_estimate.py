@@ -34,7 +34,7 @@ class BundleOptions:
     distortion_sigma: float = 0.02
     """How far that term may lie from its file, one sigma."""
     lens_gate_sigma: float = 3.0
-    """`if-seen` estimates a lens where the pictures contradict its file by so many sigmas."""
+    """`if-seen` estimates the lenses where the pictures contradict a file by so many sigmas."""
     tracks: bool = True
     """Join correspondences that share a keypoint into one floor point; else each is its own."""
     start_sightings: int = 250

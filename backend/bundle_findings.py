@@ -17,6 +17,10 @@ FAR_OFF_SIGMA = 3.0
 """A file's number further off than so many sigmas is worth a line."""
 WOBBLE_SHARE = 1.5
 """A wobble that exceeds its sigma by this factor is worth a line."""
+LITTLE_WAY = 0.1
+"""Views that lie closer together, in camera heights, tell little of how the camera looks."""
+LITTLE_TURN_DEG = 10.0
+"""Headings that spread less tell little of the focal length."""
 NOISE_SHARE = 2.0
 """So is a noise of the correspondences off by this factor, either way."""
 
@@ -31,7 +35,11 @@ def findings_of(
     """List all statements; `shared` is the covariance of the robots' unknowns."""
     return (
         *_apart(team, problem),
-        *(finding for mount in mounts for finding in _mount(mount)),
+        *(
+            finding
+            for index, mount in enumerate(mounts)
+            for finding in _mount(mount, _cause(problem, solution, index))
+        ),
         *_relative_heights(team, problem, solution, shared),
         *_wobble(team, problem, solution),
         *_noise(team, solution),
@@ -57,7 +65,22 @@ def _apart(team: Team, problem: Problem) -> Iterator[Finding]:
         yield Finding(FindingKind.APART, team.robots, float(count), text)
 
 
-def _mount(mount: MountEstimate) -> Iterator[Finding]:
+def _cause(problem: Problem, solution: Solution, robot: int) -> str:
+    """Say what motion is missing that would tell a robot's calibration, if any."""
+    mine = problem.priors.robot_of == robot
+    pose, height = solution.state.pose[mine], solution.state.attitude[mine, 2]
+    # The mean direction's length falls below 1 as headings spread.
+    turned = abs(np.mean(np.exp(1j * pose[:, 2])))
+    spread = math.degrees(math.sqrt(-2.0 * math.log(max(turned, 1e-9)))) if turned < 1.0 else 0.0
+    way = float(np.hypot(*np.ptp(pose[:, :2], axis=0)) / height.mean())
+    if way < LITTLE_WAY:
+        return f"; its views lie within {way:.2g} heights of each other"
+    if spread < LITTLE_TURN_DEG:
+        return f"; its views head the same way within {spread:.2g} deg"
+    return ""
+
+
+def _mount(mount: MountEstimate, cause: str) -> Iterator[Finding]:
     """One robot's calibration numbers."""
     degree = 180.0 / math.pi
     rows: tuple[tuple[str, Estimated | None, float, str], ...] = (
@@ -72,7 +95,8 @@ def _mount(mount: MountEstimate) -> Iterator[Finding]:
         if found.value is None:
             share = found.sigma / found.prior_sigma
             text = (
-                f"{mount.robot}: {name} is not observable here (sigma {share:.0%} of the prior's)"
+                f"{mount.robot}: {name} is not observable here "
+                f"(sigma {share:.0%} of the prior's{cause})"
             )
             yield Finding(FindingKind.UNOBSERVABLE, (mount.robot,), share, text)
         elif abs(found.value) > FAR_OFF_SIGMA * found.sigma:

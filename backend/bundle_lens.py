@@ -1,7 +1,7 @@
 """Whether the pictures contradict the files' lenses, and the bundle with better ones; numpy only.
 
 An unknown that the pictures hardly tell costs accuracy and gains nothing, so a focal length stays
-as filed unless the first step of freeing it is significant.
+as filed unless the first step of freeing it is significant for some robot.
 """
 
 from dataclasses import dataclass, replace
@@ -54,7 +54,9 @@ def refine_lenses(
     spread = np.sqrt(np.diag(inverse_between(system.factor, robots))).reshape(-1, 6)[:, 3:5]
     told = spread < options.observed_share * priors.shared_sigma[3:5]
     significant = np.abs(step[robots, 3:5]) > options.lens_gate_sigma * spread
-    freed = wanted & ((told & significant) | (asked == Refine.ALWAYS))
+    # Where one file is contradicted, the others are no better founded.
+    contradicted = (wanted & told & significant).any(axis=0)
+    freed = wanted & ((told & contradicted) | (asked == Refine.ALWAYS))
     sigma = np.where(wanted, spread, np.nan)
     if not freed.any():
         return problem, solution, LensTest(sigma, freed)

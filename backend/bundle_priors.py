@@ -132,12 +132,19 @@ def _by_offset(priors: Priors) -> Array:
 
 def between_residual(state: State, between: Between) -> Array:
     """Whitened errors (n, 3) of relative poses, tangent at b."""
-    errors = np.zeros((len(between.i), 3))
+    errors, _ = _between_errors(state, between)
+    whitened: Array = (between.whitener @ errors[:, :, None])[:, :, 0]
+    return whitened
+
+
+def _between_errors(state: State, between: Between) -> tuple[Array, Array]:
+    """Errors b_from_a @ measured (n, 3), and adjoints (n, 3, 3) of b_from_a."""
+    errors, adjoints = np.zeros((len(between.i), 3)), np.zeros((len(between.i), 3, 3))
     for count, (i, j) in enumerate(zip(between.i.tolist(), between.j.tolist(), strict=True)):
         b_from_a = Se2(*state.pose[j]).inverse() @ Se2(*state.pose[i])
         errors[count] = (b_from_a @ Se2(*between.pose[count])).vector()
-    whitened: Array = (between.whitener @ errors[:, :, None])[:, :, 0]
-    return whitened
+        adjoints[count] = b_from_a.adjoint()
+    return errors, adjoints
 
 
 def prior_cost(state: State, priors: Priors, between: Between) -> float:
@@ -206,8 +213,10 @@ def between_right(state: State, between: Between, priors: Priors) -> Array:
 
 def _by_ends(state: State, between: Between, priors: Priors) -> tuple[Array, Array]:
     """Derivatives (n, 3, 3) of the whitened errors by right steps of a and of b."""
-    by_a = np.zeros((len(between.i), 3, 3))
-    for count, (i, j) in enumerate(zip(between.i.tolist(), between.j.tolist(), strict=True)):
-        by_a[count] = (Se2(*state.pose[j]).inverse() @ Se2(*state.pose[i])).adjoint()
-    by_a = between.whitener @ by_a * ~priors.fixed[between.i, None, None]
-    return by_a, -between.whitener * ~priors.fixed[between.j, None, None]
+    errors, adjoints = _between_errors(state, between)
+    by_left = np.zeros_like(adjoints)  # of the error's coordinates by a step on its left
+    by_left[:, [0, 1, 2], [0, 1, 2]] = 1.0
+    by_left[:, 0, 2], by_left[:, 1, 2] = -errors[:, 1], errors[:, 0]
+    by_left = between.whitener @ by_left
+    by_a = by_left @ adjoints * ~priors.fixed[between.i, None, None]
+    return by_a, -by_left * ~priors.fixed[between.j, None, None]

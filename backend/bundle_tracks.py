@@ -122,7 +122,9 @@ def sightings_from_edges(
     start = np.repeat(np.cumsum(2 * size) - 2 * size, size)
     within = np.arange(len(edge_of)) - np.repeat(np.cumsum(size) - size, size)
     links = Links(which[start + within], which[start + size[edge_of] + within], edge_of)
-    return Sightings(frame[first], ray[first], sigma[first]), links
+    # Every pair has an estimate of its own of how noisy its keypoints are.
+    mean_square = np.bincount(which, sigma**2) / np.bincount(which)
+    return Sightings(frame[first], ray[first], np.sqrt(mean_square)), links
 
 
 def thinned(links: Links, sightings: Sightings, most: int) -> Mask:
@@ -135,11 +137,11 @@ def thinned(links: Links, sightings: Sightings, most: int) -> Mask:
     first = (np.cumsum(count) - count)[pairs]
     ends = np.stack([sightings.frame[links.a[first]], sightings.frame[links.b[first]]])
     pairs_of_frame = np.bincount(ends.ravel())
-    share = np.zeros(len(count))
-    share[pairs] = most / pairs_of_frame[ends].min(axis=0)
-    part = np.minimum(share / np.maximum(count, 1), 1.0)[links.edge]
+    quota = np.zeros(len(count), dtype=np.int64)
+    quota[pairs] = -(-most // pairs_of_frame[ends].min(axis=0))  # rounded up
+    quota, size = np.minimum(quota, count)[links.edge], count[links.edge]
     within = np.arange(len(links)) - (np.cumsum(count) - count)[links.edge]
-    kept: Mask = np.floor((within + 1) * part) > np.floor(within * part)
+    kept: Mask = (within + 1) * quota // size > within * quota // size
     return kept
 
 

@@ -1,0 +1,148 @@
+"""The bundle's camera against the front-end's, `transfer` and differences."""
+
+import math
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from groundfuse.backend.bundle_model import (
+    State,
+    derivatives,
+    floor_points,
+    moved,
+    residuals,
+    through_lens,
+    view_of,
+)
+from groundfuse.backend.bundle_tracks import Sightings, observations
+from groundfuse.backend.measurement import Attitude, Se2
+from groundfuse.backend.reprojection import transfer
+from groundfuse.frontend.overhead import floor_from_rays, rays_from_floor
+
+# Two routes to one ray in double precision: eps x 1e2 (depth over 0.05 heights), worst seen 9e-14.
+TOLERANCE_RAY = 1e-11
+# Central differences with step 1e-6: see test_reprojection.py; worst seen 2e-7.
+TOLERANCE_DERIVATIVE = 4e-6
+STEP = 1e-6
+ROBOT_OF = np.array([0, 1])
+
+attitudes = st.tuples(st.floats(-0.9, 0.9), st.floats(-0.3, 0.3), st.floats(0.3, 3.0))
+poses = st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(-3.1, 3.1))
+lenses = st.tuples(st.floats(-0.05, 0.05), st.floats(-0.05, 0.05))
+
+
+def seen_from(pose, attitude, lens, seed):
+    """Two frames (the second is under test) and what the second sees of random points."""
+    rng = np.random.default_rng(seed)
+    floor = rng.uniform(-2, 2, (300, 2))
+    rays = rays_from_floor(Attitude(*attitude), Se2(*pose).inverse().apply(floor))
+    inside = (np.abs(rays) < 1.0).all(axis=1)
+    floor, rays = floor[inside], rays[inside]
+    measured = rays * (1 + lens[0]) * (1 + lens[1] * (rays**2).sum(axis=1))[:, None]
+    frame = np.ones(len(rays), dtype=np.int64)
+    sightings = Sightings(frame, measured, np.full(len(rays), 1e-3))
+    seen = observations(sightings, np.arange(len(rays)), np.arange(len(rays)), 2)
+    shared = np.zeros((2, 6))
+    shared[1, 3:5] = lens
+    state = State(
+        np.array([(0.0, 0.0, 0.0), pose]), np.array([(0.1, 0.0, 1.0), attitude]), shared, floor
+    )
+    return seen, state
+
+
+@given(poses, attitudes, lenses, st.integers(0, 99))
+def test_the_truth_has_no_residual(pose, attitude, lens, seed):
+    seen, state = seen_from(pose, attitude, lens, seed)
+    residual, unseen = residuals(seen, state, ROBOT_OF)
+    assert not unseen.any()
+    np.testing.assert_allclose(residual, 0.0, atol=TOLERANCE_RAY)
+
+
+@given(poses, attitudes, attitudes, st.integers(0, 99))
+def test_derivatives_agree_with_the_transfer(pose, attitude, other, seed):
+    seen, state = seen_from(pose, attitude, (0.0, 0.0), seed)
+    floor = state.point[seen.point]
+    rays_a = rays_from_floor(Attitude(*other), floor)
+    good = np.isfinite(rays_a).all(axis=1) & (np.abs(rays_a) < 2.0).all(axis=1)
+    expected = transfer(rays_a, np.array(other), np.array(pose), np.array(attitude))
+    found = derivatives(view_of(seen, state, slice(0, len(seen.frame))))
+    by_frame = found.by_frame.transpose(1, 2, 0)
+    scale = 1.0 + np.abs(by_frame[good])
+    wanted = np.concatenate([expected.by_pose, expected.by_attitude_b], axis=2)[good]
+    np.testing.assert_allclose(by_frame[good] / scale, wanted / scale, atol=1e-8)
+
+
+@given(poses, attitudes, lenses, st.integers(0, 99))
+def test_derivatives_agree_with_differences(pose, attitude, lens, seed):
+    seen, state = seen_from(pose, attitude, lens, seed)
+    whole = slice(0, len(seen.frame))
+    view = view_of(seen, state, whole)
+    found = through_lens(derivatives(view), view, state.shared[ROBOT_OF[seen.frame]])
+
+    def changed(node, axis, size):
+        step = np.zeros((4, 6))
+        step[node, axis] = size
+        return residuals(seen, moved(state, step, np.zeros_like(state.point)), ROBOT_OF)[0]
+
+    def point_changed(axis, size):
+        step = np.zeros_like(state.point)
+        step[:, axis] = size
+        return residuals(seen, moved(state, np.zeros((4, 6)), step), ROBOT_OF)[0]
+
+    cases = [(found.by_frame[k], lambda s, k=k: changed(1, k, s)) for k in range(6)]
+    cases += [(found.by_lens[k], lambda s, k=k: changed(3, 3 + k, s)) for k in range(2)]
+    cases += [(found.by_point[k], lambda s, k=k: point_changed(k, s)) for k in range(2)]
+    for analytic, at in cases:
+        numeric = (at(-STEP) - at(STEP)) / (2 * STEP)  # a residual falls as the prediction grows
+        assert (np.abs(analytic - numeric) / (1 + np.abs(analytic)) < TOLERANCE_DERIVATIVE).all()
+
+
+@given(poses, attitudes, st.integers(0, 99))
+def test_rays_meet_the_floor_where_the_front_end_says(pose, attitude, seed):
+    seen, state = seen_from(pose, attitude, (0.0, 0.0), seed)
+    points, by_ray = floor_points(seen.frame, seen.ray, state, ROBOT_OF)
+    expected = Se2(*pose).apply(floor_from_rays(Attitude(*attitude), seen.ray))
+    np.testing.assert_allclose(points, expected, atol=TOLERANCE_RAY * 100)
+    for axis in range(2):
+        step = np.eye(2)[axis] * STEP
+        plus, _ = floor_points(seen.frame, seen.ray + step, state, ROBOT_OF)
+        minus, _ = floor_points(seen.frame, seen.ray - step, state, ROBOT_OF)
+        numeric, analytic = (plus - minus) / (2 * STEP), by_ray[:, :, axis]
+        scale = 1.0 + np.abs(analytic) ** 1.5  # the third derivative grows faster than the first
+        assert (np.abs(analytic - numeric) / scale < 10 * TOLERANCE_DERIVATIVE).all()
+
+
+def test_the_lens_is_taken_off_before_rays_meet_the_floor():
+    # The inverse is to first order in the distortion: 0.01^2 x radius^4 of a ray of length 0.5.
+    seen, state = seen_from((0.3, -0.2, 1.0), (0.5, 0.05, 0.8), (0.01, 0.01), 1)
+    points, _ = floor_points(seen.frame, seen.ray, state, ROBOT_OF)
+    np.testing.assert_allclose(points, state.point[seen.point], atol=3e-3)
+    plain, _ = floor_points(seen.frame, seen.ray, with_shared(state, 0.0), ROBOT_OF)
+    off, better = np.abs(plain - state.point[seen.point]), np.abs(points - state.point[seen.point])
+    assert better.max() < off.max() / 20
+
+
+def with_shared(state, value):
+    return State(state.pose, state.attitude, np.full_like(state.shared, value), state.point)
+
+
+def test_a_point_behind_the_camera_is_unseen():
+    seen, state = seen_from((0.0, 0.0, 0.0), (0.8, 0.0, 0.5), (0.0, 0.0), 2)
+    away = State(state.pose, state.attitude, state.shared, state.point - np.array([50.0, 0.0]))
+    _, unseen = residuals(seen, away, ROBOT_OF)
+    assert unseen.all()
+    points, _ = floor_points(np.array([1]), np.array([[0.0, -3.0]]), state, ROBOT_OF)
+    assert np.isnan(points).all()
+
+
+def test_a_step_perturbs_the_pose_on_the_right():
+    pose = Se2(0.4, -0.3, 2.0)
+    state = State(np.array([pose.vector()]), np.zeros((1, 3)), np.zeros((1, 6)), np.zeros((0, 2)))
+    step = np.array([[1e-3, -2e-3, 0.01, 0.1, 0.2, 0.3], [0.0, 0.0, 0.0, 0.5, 0.6, 0.0]])
+    after = moved(state, step, np.zeros((0, 2)))
+    expected = pose @ Se2(1e-3, -2e-3, 0.0) @ Se2(0.0, 0.0, 0.01)
+    np.testing.assert_allclose(after.pose[0], expected.vector(), atol=1e-15)
+    np.testing.assert_array_equal(after.attitude, [[0.1, 0.2, 0.3]])
+    assert math.isclose(after.shared[0, 3], 0.5)
+    assert math.isclose(after.shared[0, 4], 0.6)
