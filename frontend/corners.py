@@ -39,6 +39,8 @@ class CornerOptions:
     """A corner is the strongest within this distance."""
     per_square_height: float = 350.0
     """Corners per squared camera height of useful floor, strongest first."""
+    min_corners: int = 300
+    """Corners of a camera that sees too little floor for that many, if there are so many."""
     max_corners: int = 900
     """Most corners of one picture."""
     sigma_ratio: float = 0.16
@@ -81,12 +83,9 @@ def find_corners(
     ]
     px, strength, sigma_px = (np.concatenate(part) for part in zip(*found, strict=True))
     order = np.argsort(-strength, kind="stable")
-    height_m = camera.mount.attitude.height_m
-    area_heights = float(
-        (length_m[useful] / height_m).astype(np.float64) @ (length_m[useful] / height_m)
-    )
-    count = min(options.max_corners, round(options.per_square_height * area_heights))
-    kept = order[:count]
+    lengths = length_m[useful].astype(np.float64) / camera.mount.attitude.height_m
+    count = round(options.per_square_height * float(lengths @ lengths))
+    kept = order[: min(max(count, options.min_corners), options.max_corners)]
     return Corners(px[kept], sigma_px[kept] * options.sigma_ratio)
 
 

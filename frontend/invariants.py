@@ -13,6 +13,7 @@ import numpy as np
 from groundfuse.frontend.arrays import Floats, Image, Mask, Picture32, Points
 from groundfuse.frontend.normalise import local_contrast
 
+SMALLEST_WEIGHT = np.float32(1e-3)
 SMALLEST_SPREAD = 1e-6
 """Of a number that is the same at all points, over 255 grey values."""
 
@@ -37,23 +38,27 @@ def sigmoid(t: Floats, mu: Floats | float, t0: Floats | float) -> Floats:
     return squashed
 
 
-def colour_planes(view: Image, mask: Mask, options: InvariantOptions) -> Picture32:
-    """Return (rows, columns, 6): filtered R, G, B in 0 to 1, then their gradients per cell.
+def colour_values(view: Image, mask: Mask, points_px: Points, options: InvariantOptions) -> Floats:
+    """Return (n, 6): filtered R, G, B in 0 to 1, then their gradients per cell (paper eq. 2).
 
     Args:
         view: (rows, columns, 3) BGR overhead view, or (rows, columns) grey.
         mask: (rows, columns) floor; the filters do not reach beyond it.
+        points_px: (n, 2) where.
         options: see there.
     """
-    colours = _rgb(view, mask, options)
-    weight = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), options.sigma_cells)
-    inside = np.maximum(weight, 1e-3)[:, :, None]
-    masked = colours * mask[:, :, None]
-    smooth = cv2.GaussianBlur(masked, (0, 0), options.sigma_cells) / inside
-    by_u = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1.0 / 8.0)
-    by_v = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1.0 / 8.0)
-    planes = np.concatenate([smooth, np.hypot(by_u, by_v)], axis=2)
-    return np.asarray(planes, dtype=np.float32)
+    weight = mask.astype(np.float32)
+    inside = np.maximum(cv2.GaussianBlur(weight, (0, 0), options.sigma_cells), SMALLEST_WEIGHT)
+    masked = _rgb(view, mask, options) * weight[:, :, None]
+    blurred = cv2.GaussianBlur(masked, (0, 0), options.sigma_cells) / inside[:, :, None]
+    smooth = np.asarray(blurred, dtype=np.float32)
+
+    def at(du: float, dv: float) -> Floats:
+        return _sampled(smooth, points_px + np.array([du, dv]))
+
+    by_u, by_v = (at(1, 0) - at(-1, 0)) / 2.0, (at(0, 1) - at(0, -1)) / 2.0
+    values: Floats = np.hstack([at(0, 0), np.hypot(by_u, by_v)])
+    return values
 
 
 def invariants(
@@ -63,21 +68,17 @@ def invariants(
     options = options or InvariantOptions()
     if len(points_px) == 0:
         return np.zeros((0, 6))
-    values = sampled(colour_planes(view, mask, options), points_px)
+    values = colour_values(view, mask, points_px, options)
     centre = np.median(values, axis=0)
     spread = np.maximum(values.std(axis=0), SMALLEST_SPREAD)
     return sigmoid(values, options.slope / spread, centre)
 
 
-def sampled(planes: Picture32, points_px: Points) -> Floats:
+def _sampled(picture: Picture32, points_px: Points) -> Floats:
     """Return the values (n, channels) of a picture at points (n, 2), bilinear."""
     u, v = (np.ascontiguousarray(points_px[:, k], dtype=np.float32)[None] for k in (0, 1))
-    columns = [
-        cv2.remap(np.ascontiguousarray(planes[:, :, k]), u, v, cv2.INTER_LINEAR)[0]
-        for k in range(planes.shape[2])
-    ]
-    values: Floats = np.stack(columns, axis=1).astype(np.float64)
-    return values
+    values = cv2.remap(picture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(values[0], dtype=np.float64)
 
 
 def _rgb(view: Image, mask: Mask, options: InvariantOptions) -> Picture32:

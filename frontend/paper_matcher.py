@@ -6,12 +6,13 @@ real input, see `corners.py` (one scale on the floor), `invariants.py` (mu and t
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 
-from groundfuse.backend.measurement import Attitude, Correspondences, Reason, Se2
+from groundfuse.backend.measurement import Attitude, Correspondences, Reason
 from groundfuse.frontend.arrays import Floats, Image, Picture32, Points
 from groundfuse.frontend.camera import Camera
 from groundfuse.frontend.corners import CornerOptions, find_corners
@@ -20,7 +21,7 @@ from groundfuse.frontend.invariants import InvariantOptions, invariants
 from groundfuse.frontend.matches import Matches, Miss
 from groundfuse.frontend.overhead import floor_from_rays
 from groundfuse.frontend.overhead_view import OverheadOptions, overhead_grid, overhead_view
-from groundfuse.frontend.refine import Guided, RefineOptions, refined_homography
+from groundfuse.frontend.refine import Guided, RefineOptions, num_in_common, refined_homography
 from groundfuse.frontend.segments import (
     Scene,
     SegmentOptions,
@@ -29,6 +30,11 @@ from groundfuse.frontend.segments import (
     nearest_candidates,
     voted,
 )
+
+LEAST_IN_COMMON = 1.0 / 3.0
+"""A rival with less of the best motion's corners in common is too small to count."""
+MOST_SHARED = 0.3
+"""A rival that shares more of its matches with the best motion is the same motion."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,8 +63,6 @@ class PaperOptions:
     """Fewest corners that agree on the homography."""
     min_inlier_ratio: float = 0.08
     """Fewest over the corners of the frame that has fewer: chance alone gives up to 0.06."""
-    vote_tolerance: float = 0.025
-    """A candidate supports an isometry within this distance, camera heights."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,34 +148,35 @@ def match(
     most = votes[0].num_segments if votes else 0
     if most < options.min_segments:
         return Miss(Reason.FEW_CANDIDATES, float(most), float(options.min_segments))
-    support = [supporters(scene, vote.a_from_b, options.vote_tolerance) for vote in votes]
-    best = int(np.argmax(support))
-    rivals = max((count for k, count in enumerate(support) if k != best), default=0)
-    ambiguity = rivals / max(support[best], 1)
-    return _refined(a, b, votes[best].a_from_b, ambiguity, options)
-
-
-def supporters(scene: Scene, a_from_b: Se2, tolerance: float) -> int:
-    """Count the points of a with a candidate within a tolerance (camera heights) of its place."""
-    candidates = scene.candidates
-    in_a = a_from_b.apply(scene.b.floor_m[candidates.b])
-    off = np.hypot(*(in_a - scene.a.floor_m[candidates.a]).T)
-    return len(np.unique(candidates.a[off < tolerance * scene.height_m]))
-
-
-def _refined(
-    a: PaperFeatures, b: PaperFeatures, isometry: Se2, ambiguity: float, options: PaperOptions
-) -> Matches | Miss:
-    """Refine to a homography and take it apart (paper §3 and §4)."""
-    start = floor_homography(a.attitude, isometry, b.attitude)
+    start = [floor_homography(a.attitude, vote.a_from_b, b.attitude) for vote in votes]
     rays, described = (a.rays, b.rays), (a.invariants, b.invariants)
-    found = refined_homography(start, rays, described, b.focal_px, options.refine)
-    count = len(found.index_a)
-    needed = max(options.min_inliers, math.ceil(options.min_inlier_ratio * min(len(a), len(b))))
+    found = [refined_homography(h, rays, described, b.focal_px, options.refine) for h in start]
+    found.sort(key=lambda guided: -len(guided.index_a))
+    best, count = found[0], len(found[0].index_a)
+    needed = max(options.min_inliers, math.ceil(options.min_inlier_ratio * fewest))
     if count < needed:
         return Miss(Reason.FEW_INLIERS, float(count), float(needed))
-    motion = decompose(found.b_from_a, a.attitude, b.attitude, options.decomposition)
-    return Matches(_correspondences(a, b, found), motion.a_from_b, ambiguity)
+    motion = decompose(best.b_from_a, a.attitude, b.attitude, options.decomposition)
+    return Matches(_correspondences(a, b, best), motion.a_from_b, ambiguity(found, rays))
+
+
+def ambiguity(found: Sequence[Guided], rays: tuple[Points, Points]) -> float:
+    """Return how well the best rival does: its agreement over that of the first, at most 1.
+
+    The agreement is the share of the corners in common that match, not their number: on a floor
+    that repeats, a motion with less floor in common is as good an explanation as any. Rivals with
+    much less in common say nothing. So does one that was drawn to the matches of the first.
+    """
+    best, *rivals = found
+    in_common = num_in_common(best.b_from_a, *rays)
+    own = set(zip(best.index_a.tolist(), best.index_b.tolist(), strict=True))
+    worst = 0.0
+    for rival in rivals:
+        pairs = set(zip(rival.index_a.tolist(), rival.index_b.tolist(), strict=True))
+        common = num_in_common(rival.b_from_a, *rays)
+        if common > in_common * LEAST_IN_COMMON and len(pairs & own) < MOST_SHARED * len(pairs):
+            worst = max(worst, len(pairs) / common * in_common / len(own))
+    return min(worst, 1.0)
 
 
 def _correspondences(a: PaperFeatures, b: PaperFeatures, found: Guided) -> Correspondences:

@@ -15,6 +15,8 @@ from scipy.spatial import KDTree
 from groundfuse.frontend.arrays import Floats, Matrix, Points
 
 SMALLEST_WEIGHT = 1e-3
+NEIGHBOURHOOD = 0.08
+"""No part of a picture is farther from its corners than this, in focal lengths."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -147,6 +149,14 @@ def refined_homography(
         weights = 1.0 / (1.0 + (off / (window / 4.0)) ** 2)  # Cauchy
         homography = fitted_homography(rays_a, rays_b, np.maximum(weights, SMALLEST_WEIGHT))
     return guided_matches(homography, rays, invariants, last, options)
+
+
+def num_in_common(b_from_a: Matrix, rays_a: Points, rays_b: Points) -> int:
+    """Count the corners of a that fall where b has corners at all."""
+    expected = transferred(b_from_a, rays_a)
+    expected = expected[np.isfinite(expected).all(axis=1)]
+    distance, _ = KDTree(rays_b).query(expected, distance_upper_bound=NEIGHBOURHOOD)
+    return int(np.isfinite(distance).sum())
 
 
 def _normalisation(points: Points) -> Matrix:

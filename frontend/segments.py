@@ -16,6 +16,8 @@ from scipy.spatial import KDTree
 from groundfuse.backend.measurement import Se2
 from groundfuse.frontend.arrays import Floats, Picture32, Points
 
+RANK_TABLE = 256
+"""Entries of the first neighbour in the table that ranks are drawn from."""
 FLAT_GREY = 1e-3
 """Profiles that vary less than this count as not correlated."""
 
@@ -26,7 +28,7 @@ class SegmentOptions:
 
     num_neighbours: int = 10
     """Candidates of each point: the nearest by invariants, without ratio test."""
-    num_draws: int = 300_000
+    num_draws: int = 500_000
     """Pairs of candidates that are drawn."""
     min_length: float = 0.12
     """Shortest segment: a shorter one tells too little about the turn."""
@@ -138,28 +140,38 @@ def matched_segments(scene: Scene, options: SegmentOptions, rng: np.random.Gener
     """Return (m, 2) indices of candidate pairs whose segments match in length and profile."""
     a, b, candidates, height_m = scene
     one, two = _drawn(candidates, options.num_draws, rng)
-    length_a = np.hypot(*(a.floor_m[candidates.a[two]] - a.floor_m[candidates.a[one]]).T)
-    length_b = np.hypot(*(b.floor_m[candidates.b[two]] - b.floor_m[candidates.b[one]]).T)
-    cells_m = options.length_tolerance_cells * max(a.m_per_px, b.m_per_px)
-    tolerance_m = cells_m + options.length_tolerance_ratio * length_a
-    equal = np.abs(length_a - length_b) < tolerance_m  # eq. 4
+    length_a = _lengths(a.floor_m[candidates.a], one, two)
+    length_b = _lengths(b.floor_m[candidates.b], one, two)
+    tolerance_m = options.length_tolerance_cells * max(a.m_per_px, b.m_per_px)
+    equal = np.abs(length_a - length_b) < options.length_tolerance_ratio * length_a + tolerance_m
     equal &= length_a > options.min_length * height_m
     equal &= length_a < options.max_length * height_m
-    one, two = one[equal], two[equal]
+    one, two = one[equal], two[equal]  # eq. 4
     profile_a = profile(a, candidates.a[one], candidates.a[two], options.num_steps)
     profile_b = profile(b, candidates.b[one], candidates.b[two], options.num_steps)
     alike = (profile_a * profile_b).sum(axis=1) > options.min_correlation  # eq. 5
     return np.stack([one[alike], two[alike]], axis=1)
 
 
-def _drawn(candidates: Candidates, num_draws: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw (2, num_draws) candidates: any point of a, its nearer neighbours more often."""
-    weight = 1.0 / (1.0 + np.arange(candidates.num_ranks))
-    edges = np.cumsum(weight / weight.sum())[:-1]
-    rank = np.searchsorted(edges, rng.random((2, num_draws)), side="right")
+def _drawn(
+    candidates: Candidates, num_draws: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw pairs of candidates: any two points of a, their nearer neighbours more often."""
+    ranks = np.arange(candidates.num_ranks)
+    table = np.repeat(ranks, np.ceil(RANK_TABLE / (1.0 + ranks)).astype(int)).astype(np.int32)
     num_points = len(candidates.a) // candidates.num_ranks
-    drawn: np.ndarray = rng.integers(num_points, size=(2, num_draws)) * candidates.num_ranks + rank
-    return drawn
+    points = rng.integers(num_points, size=(2, num_draws), dtype=np.int32)
+    rank = table[rng.integers(len(table), size=(2, num_draws), dtype=np.int32)]
+    one, two = points * candidates.num_ranks + rank
+    return one, two
+
+
+def _lengths(points: Points, one: np.ndarray, two: np.ndarray) -> Picture32:
+    """Distances between two points each; single precision is exact to a ten-millionth of it."""
+    x, y = points.T.astype(np.float32)
+    along_x, along_y = x[two] - x[one], y[two] - y[one]
+    lengths: Picture32 = np.sqrt(along_x * along_x + along_y * along_y)
+    return lengths
 
 
 def voted(scene: Scene, segments: np.ndarray, options: SegmentOptions) -> list[Vote]:
