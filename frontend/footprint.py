@@ -1,6 +1,7 @@
 """Which floor a picture shows, and how finely: the lattice behind a mosaic's extent and cell."""
 
 import functools
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,7 @@ from groundfuse.frontend.overhead import floor_from_rays
 
 LATTICE_COLUMNS = 33
 LATTICE_ROWS = 49
+OUTWARDS = 1.2
 BEYOND = 1.5
 """A lattice point past the limit still counts for the extent when its neighbour is within it and
 it is at most this many times too coarse: the limit itself lies between the two."""
@@ -31,8 +33,9 @@ class Footprint:
     m_per_px: Floats
 
     def finest_m_per_px(self, share: float) -> float:
-        """Return the length that this share of the picture's pixels stays below."""
-        return float(np.nanquantile(self.m_per_px, share))
+        """Return the length that this share of the pixels stays below; inf above the horizon."""
+        on_floor = self.m_per_px[np.isfinite(self.m_per_px)]
+        return float(np.quantile(on_floor, share)) if on_floor.size else math.inf
 
     def bounds(self, limit_m: float) -> tuple[Points, Points] | None:
         """Return the lowest and highest (x, y) of the floor resolved within the limit, or None."""
@@ -60,10 +63,22 @@ def _lattice(camera: Camera) -> tuple[Points, Floats, Floats]:
     return camera.intrinsics.rays_from_px(px), v, u
 
 
+@functools.lru_cache(maxsize=64)
 def widest_ray(camera: Camera) -> float:
-    """Return the length of a camera's widest ray; wider ones can fold back into the picture."""
+    """Return the length up to which rays grow outwards in the picture; wider ones may fold back.
+
+    A little over the picture's own widest ray where the lens allows: what lies just outside is
+    needed to interpolate at the corners.
+    """
+    if not any(camera.intrinsics.coefficients):
+        return math.inf
     rays, _, _ = _lattice(camera)
-    return float(np.nanmax(np.hypot(rays[:, 0], rays[:, 1])))
+    length = np.nan_to_num(np.hypot(rays[:, 0], rays[:, 1]))
+    corner = rays[np.argmax(length)]
+    outwards = camera.intrinsics.px_from_rays(np.linspace(1.0, OUTWARDS, 41)[:, None] * corner)
+    steps = np.diff(outwards, axis=0) @ (outwards[0] - camera.intrinsics.px_from_rays(0 * rays)[0])
+    growing = int(np.argmin(np.append(steps, -np.inf) > 0.0))
+    return float(length.max() * (1.0 + (OUTWARDS - 1.0) * growing / 40.0))
 
 
 def footprint(camera: Camera, attitude: Attitude, team_from_foot: Se2) -> Footprint:

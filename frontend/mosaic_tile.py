@@ -45,26 +45,25 @@ class TileStack:
         self,
         offset: tuple[int, int],
         seen: Mask,
-        colours: Floats,
-        footprint: Floats,
-        weight: Floats,
+        colours: Picture32,
+        footprint: Picture32,
+        weight: Picture32,
     ) -> None:
         """Add one view of a window of the tile.
 
         Args:
             offset: row and column of the window's first cell.
             seen: (n, m) cells of the window that count.
-            colours: (n, m, 3) levels, compensated.
+            colours: (n, m, 3) levels, compensated, not negative.
             footprint: (n, m) length of its pixels on the floor.
             weight: (n, m) positive, in the final mean.
         """
         window = np.flatnonzero(seen)
         row, column = np.divmod(window, seen.shape[1])
         cells = (row + offset[0]) * self._shape[1] + column + offset[1]
-        picked = np.rint(np.clip(colours.reshape(-1, 3)[window], 0.0, HIGHEST) * LEVEL)
-        half_levels = picked.T.astype(np.uint16)
-        fine = footprint.ravel()[window].astype(np.float32)
-        share = weight.ravel()[window].astype(np.float32)
+        picked = np.minimum(colours.reshape(-1, 3)[window].T, HIGHEST) * np.float32(LEVEL)
+        half_levels = np.rint(picked).astype(np.uint16)
+        fine, share = footprint.ravel()[window], weight.ravel()[window]
         self._count[cells] += 1
         slot = self._held[cells]
         full = slot == len(self._footprint)
@@ -114,7 +113,7 @@ class TileStack:
                 weight = np.take(self._weight[:depth], cells, axis=1)
                 noise = noise_levels * LEVEL
                 floor[:, cells] = combined(colours, footprint, weight, noise, num_sigmas)
-        mean /= np.maximum(self._count, 1)
+        mean /= np.maximum(self._count, 1).astype(np.float32)
         return Tile(self._levels(floor), self._levels(mean), self._count.reshape(self._shape))
 
     def _levels(self, half_levels: Picture32) -> Image:

@@ -2,13 +2,15 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from groundfuse.backend.measurement import Attitude, Se2
 from groundfuse.frontend.area_remap import singular_values
-from groundfuse.frontend.arrays import Floats, Mask, Points
+from groundfuse.frontend.arrays import Floats, Mask, Picture32, Points
 from groundfuse.frontend.camera import Camera
 from groundfuse.frontend.footprint import widest_ray
 from groundfuse.frontend.overhead import rays_from_floor
@@ -73,15 +75,17 @@ class Sight:
     """
 
     source_px: Floats
-    footprint_cells: Floats
+    footprint_cells: Picture32
     seen: Mask
     lattice_px: Floats
     step: int
 
-    def spread(self, at_lattice: Floats) -> Floats:
+    def spread(self, at_lattice: Floats) -> Picture32:
         """Interpolate (n, m, ...) values at the lattice to the cells (rows, columns, ...)."""
         rows, columns = self.seen.shape
-        return _spread(at_lattice, self.step, slice(0, rows), slice(0, columns))
+        coarse = at_lattice.astype(np.float32)
+        fine: Picture32 = _spread(coarse, self.step, slice(0, rows), slice(0, columns))
+        return fine
 
 
 def sight(
@@ -122,7 +126,9 @@ def sight(
         footprint = step / least
     lattice = px[1:-1, 1:-1]
     source = _spread(lattice, step, slice(-1, grid.rows + 1), slice(-1, grid.columns + 1))
-    footprint_cells = _spread(footprint, step, slice(0, grid.rows), slice(0, grid.columns))
+    footprint_cells = _spread(
+        footprint.astype(np.float32), step, slice(0, grid.rows), slice(0, grid.columns)
+    )
     seen = _inside(source[1:-1, 1:-1], camera) & (footprint_cells <= limit_cells)
     return Sight(source, footprint_cells, seen, lattice, step)
 
@@ -133,14 +139,14 @@ def _step(cell_per_height: float) -> int:
     return min(max(widest, 1), LARGEST_STEP)
 
 
-def _spread(at_lattice: Floats, step: int, rows: slice, columns: slice) -> Floats:
+def _spread(at_lattice: NDArray[Any], step: int, rows: slice, columns: slice) -> NDArray[Any]:
     """Interpolate values at the blocks' middles, with a margin of one block, to a range of cells.
 
     Enlarging a picture by `step` about its pixels' middles does exactly this.
     """
     fine = cv2.resize(at_lattice, None, fx=step, fy=step, interpolation=cv2.INTER_LINEAR)
     first_row, first_column = step + rows.start, step + columns.start
-    part: Floats = np.asarray(fine, dtype=np.float64)[
+    part: NDArray[Any] = np.asarray(fine)[
         first_row : first_row + rows.stop - rows.start,
         first_column : first_column + columns.stop - columns.start,
     ]

@@ -1,0 +1,122 @@
+"""Exposure and vignetting are found from shared floor, whatever stands on it."""
+
+import numpy as np
+from analytic_floor import centres, make_camera, ring, rounded, view_of, waves
+
+from groundfuse.backend.measurement import FrameId, Se2
+from groundfuse.frontend.gains import (
+    Samples,
+    estimate_exposure,
+    neutral_exposure,
+    radius_squared,
+)
+from groundfuse.frontend.mosaic import MosaicOptions, build_mosaic
+
+# Samples are good to 2 % each, some 300 per view; 20 % of them are of obstacles.
+TOLERANCE_LOG_GAIN = 0.015
+VIEWS, CELLS = 12, 1500
+
+
+def made_samples(rng, gain, falloff, noise=0.02, obstacles=0.2):
+    """Views of random subsets of cells; view k of lens k % 2."""
+    floor = rng.uniform(3.5, 4.8, (CELLS, 3))
+    cell, view = np.nonzero(rng.random((CELLS, VIEWS)) < 0.25)
+    radius2 = rng.random(len(cell))
+    powers = radius2[:, None] ** np.array([1, 2, 3])
+    log = floor[cell] + gain[view] + (powers * falloff[view % 2]).sum(axis=1)[:, None]
+    log += rng.normal(0, noise, log.shape)
+    spoiled = rng.random(len(cell)) < obstacles
+    log[spoiled] += rng.uniform(-1.0, 1.0, (spoiled.sum(), 3))
+    colour = np.exp(log)
+    return Samples(cell, view, radius2, colour, colour)
+
+
+def test_gains_and_falloffs_are_found_among_obstacles():
+    rng = np.random.default_rng(4)
+    gain = rng.normal(0, 0.15, (VIEWS, 3))
+    gain -= gain.mean(axis=0)
+    falloff = np.array([[-0.3, -0.1, 0.0], [-0.1, 0.0, -0.2]])
+    samples = made_samples(rng, gain, falloff)
+    found = estimate_exposure(samples, np.arange(VIEWS) % 2)
+    # The floor's own brightness is free: only differences between views are known.
+    error = found.log_gain - gain
+    assert np.abs(error - error.mean(axis=0)).max() < TOLERANCE_LOG_GAIN
+    radius2 = np.linspace(0, 1, 11)
+    for lens in (0, 1):
+        expected = radius2[:, None] ** np.array([1, 2, 3]) @ falloff[lens]
+        shape = found.log_factor(lens, radius2)[:, 0] - found.log_gain[lens, 0]
+        # A constant may hide in the gains of all views of a lens.
+        difference = shape - expected
+        assert np.abs(difference - difference.mean()).max() < 2 * TOLERANCE_LOG_GAIN
+
+
+def test_noise_is_that_of_one_view():
+    rng = np.random.default_rng(5)
+    none = np.zeros((VIEWS, 3))
+    samples = made_samples(rng, none, np.zeros((2, 3)), noise=0.0, obstacles=0.1)
+    point = np.full_like(samples.colour, 100.0) + rng.normal(0, 6.0, samples.colour.shape)
+    samples = Samples(samples.cell, samples.view, samples.radius2, samples.colour, point)
+    found = estimate_exposure(samples, np.arange(VIEWS) % 2)
+    assert 5.5 < found.noise_levels < 6.5
+
+
+def test_views_that_share_nothing_stay_as_they_are():
+    samples = Samples(
+        np.arange(50), np.arange(50) % 2, np.zeros(50), np.full((50, 3), 90.0), np.zeros((50, 3))
+    )
+    found = estimate_exposure(samples, np.array([0, 0]))
+    assert (found.log_gain == 0.0).all()
+    assert (found.falloff == 0.0).all()
+    assert found.noise_levels == neutral_exposure(2).noise_levels
+
+
+def test_radius_is_one_half_diagonal_from_the_principal_point():
+    lens = make_camera().intrinsics
+    px = np.array([[lens.cx_px, lens.cy_px], [lens.cx_px + 60.0, lens.cy_px - 80.0]])
+    # 160 x 120: half a diagonal is 100.
+    np.testing.assert_allclose(radius_squared(lens, px), [0.0, 1.0], atol=1e-12)
+
+
+def test_patchwork_goes_and_the_floor_stays():
+    camera = make_camera(15.0)
+    length = 60 * 0.55 / camera.intrinsics.focal_px
+
+    def colour(points):
+        return waves(points, length)
+
+    lens = camera.intrinsics
+    v, u = np.mgrid[0:120, 0:160]
+    radius2 = radius_squared(lens, np.stack([u, v], axis=-1).astype(float))[..., None]
+    rng = np.random.default_rng(6)
+    gains = np.exp(rng.normal(0, 0.12, (8, 1, 1, 3)))
+    views = [
+        view_of(frame, camera, pose, rounded(image * gains[i] * np.exp(-0.35 * radius2)))
+        for i, (frame, pose, image) in enumerate(ring(8, camera, colour))
+    ]
+
+    def deviation(options):
+        mosaic = build_mosaic(views, options)
+        inner = mosaic.count >= 2
+        ratio = mosaic.floor[inner] / colour(centres(mosaic)[inner])
+        return (ratio / ratio.mean(axis=0)).std()
+
+    raw, evened = deviation(MosaicOptions(compensate=False)), deviation(MosaicOptions())
+    assert raw > 0.04
+    assert evened < 0.012  # rounding is 0.4 / 130, the rest is gains; worst seen 0.008
+
+
+def test_dark_and_cut_off_values_do_not_vote():
+    camera = make_camera(0.0)
+    grey = np.full((120, 160, 3), 100, np.uint8)
+    cut_off = np.full((120, 160, 3), 255, np.uint8)
+    cut_off[:, :80] = 150
+    views = [
+        view_of(FrameId("A", 0), camera, Se2(0, 0, 0), grey),
+        view_of(FrameId("A", 1), camera, Se2(0, 0, 0), cut_off),
+    ]
+    mosaic = build_mosaic(views)
+    both = mosaic.count == 2
+    half = mosaic.floor[both].reshape(-1, 3)
+    # The uncut half says 1.5 between the views, shared about evenly: sqrt(1.5) x 100.
+    values, counts = np.unique(half, return_counts=True)
+    assert abs(int(values[np.argmax(counts)]) - 122) <= 3
