@@ -58,11 +58,13 @@ def test_distortion_models(robot, given, expected, numbers):
     assert lens.coefficients == tuple(numbers)
 
 
-def test_an_echoed_camera_info_message_is_read(robot):
+@pytest.mark.parametrize(("d", "k"), [("d", "k"), ("D", "K")])
+def test_an_echoed_camera_info_message_is_read(robot, d, k):
+    """ROS 2 writes small letters, ROS 1 capitals."""
     (robot / "camera.yaml").write_text(
         "header:\n  frame_id: camera\nheight: 48\nwidth: 64\ndistortion_model: plumb_bob\n"
-        "d: [0.01, -0.002, 0.0003, 0.0001, 0.0]\n"
-        "k: [50.0, 0.0, 31.5, 0.0, 52.0, 23.5, 0.0, 0.0, 1.0]\n"
+        f"{d}: [0.01, -0.002, 0.0003, 0.0001, 0.0]\n"
+        f"{k}: [50.0, 0.0, 31.5, 0.0, 52.0, 23.5, 0.0, 0.0, 1.0]\n"
         "r: [1, 0, 0, 0, 1, 0, 0, 0, 1]\np: [50, 0, 31, 0, 0, 52, 23, 0, 0, 0, 1, 0]\n"
         "binning_x: 0\nbinning_y: 0\nroi:\n  x_offset: 0\n"
         "mount: {height_m: 0.55, tilt_deg: 33.0}\n---\n"
@@ -94,6 +96,7 @@ def test_an_echoed_camera_info_message_is_read(robot):
         ("tilt_deg: 33.0", "tilt_deg: 33\n  last_row: 48", "rows 0 to 48 are no part of a picture of 48 rows"),
         ("tilt_deg: 33.0", "tilt_deg: 33\n  zzz: 48", "unknown key in mount 'zzz' (known: first_row, height_m, height_sigma_m, last_row, roll_deg, roll_sigma_deg, tilt_deg, tilt_sigma_deg, x_m, y_m, yaw_deg)"),
         ("image_width: 64", "image_widht: 64", "unknown key 'image_widht' (did you mean 'image_width'?)"),
+        ("image_width: 64", "IMAGE_WIDTH: 64", "unknown key 'IMAGE_WIDTH' (did you mean 'image_width'?)"),
         ("image_width: 64\n", "", "missing key 'image_width' (needed: image_width, image_height, camera_matrix, distortion_model, mount)"),
         ("image_width: 64", "image_width: 0", "image size must be positive, got 0 x 48"),
         ("image_width: 64", "image_width: 64.5", "image_width must be a whole number, got 64.5"),

@@ -66,6 +66,28 @@ def test_the_horizon_allows_for_distortion(robot):
     assert "the horizon is in the used part of the picture: rows 0 to" in refusal(robot)
 
 
+@pytest.mark.parametrize("roll", [64, -64])
+def test_the_horizon_at_a_bulging_side(robot, roll):
+    """With k1 = 1 a side's middle has x = 0.50, its corners 0.47; the sky begins at 0.49."""
+    (robot / "camera.yaml").write_text(PINHOLE)
+    change(robot, "data: []", "data: [1.0, 0.0, 0.0, 0.0, 0.0]")
+    change(robot, "tilt_deg: 33.0", f"tilt_deg: 0\n  roll_deg: {roll}")
+    assert refusal(robot).endswith("have sky; check tilt_deg (0 looks straight down) and roll_deg")
+    change(robot, f"roll_deg: {roll}", "roll_deg: 62")
+    read(robot)
+
+
+def test_the_horizon_in_a_round_picture_with_a_black_border(robot):
+    """The whole border is beyond 90 deg off the axis, only the inside can tell."""
+    change(robot, "distortion_model: plumb_bob", "distortion_model: equidistant")
+    change(robot, "[0.01, -0.002, 0.0003, 0.0001, 0.0]", "[1.0e-9, 0.0, 0.0, 0.0]")
+    change(robot, "50.0, 0.0, 31.5, 0.0, 52.0", "14.5, 0.0, 31.5, 0.0, 14.5")
+    change(robot, "tilt_deg: 33.0", "tilt_deg: 0")
+    read(robot)
+    change(robot, "tilt_deg: 0", "tilt_deg: 10")
+    assert "the horizon is in the used part of the picture" in refusal(robot)
+
+
 def test_the_horizon_of_one_frame(robot):
     (robot / "frames.csv").write_text("image,tilt_deg\nimg1.png,33\nimg2.png,85\n")
     assert refusal(robot).startswith(

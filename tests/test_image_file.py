@@ -1,6 +1,8 @@
 # ruff: noqa: E501 (messages stay whole)
 """Pictures come back as the sensor saw them, and none that was cut short goes unseen."""
 
+import struct
+
 import numpy as np
 import pytest
 from small_team import (
@@ -41,7 +43,10 @@ def test_grey_16_bit_and_alpha_become_bgr(robot):
     alpha = np.dstack([bgr, np.arange(WIDTH * HEIGHT, dtype=np.uint8).reshape(HEIGHT, WIDTH)])
     assert np.array_equal(loaded(store(robot, "x.png", encoded(alpha))), bgr)
     for suffix in (".png", ".tif"):
-        deep = encoded(bgr.astype(np.uint16) * 257, suffix)  # 257 = 65535 / 255
+        # 257 = 65535 / 255; 128 more is just under half a step of 8 bits
+        deep = encoded(
+            np.minimum(bgr.astype(np.uint32) * 257 + 128, 65535).astype(np.uint16), suffix
+        )
         assert np.array_equal(loaded(store(robot, f"x{suffix}", deep)), bgr)
         assert np.array_equal(
             loaded(store(robot, f"x{suffix}", encoded(grey.astype(np.uint16) * 257, suffix))),
@@ -93,6 +98,28 @@ def test_no_cut_anywhere_goes_unseen(robot, suffix):
     zeroed = data[: len(data) // 2] + bytes(len(data) - len(data) // 2)
     if suffix != ".tif":  # a TIFF says where its pixels are, not that they are there
         assert "cut short" in refusal(store(robot, f"x{suffix}", zeroed))
+
+
+def tiff(order):
+    """A TIFF with its directory first and its pixels last, as cameras write it."""
+    strip = 8 + 2 + 12 * 9 + 4
+    entries = [(256, 4, WIDTH), (257, 3, HEIGHT), (258, 3, 8), (259, 3, 1), (262, 3, 1)]
+    entries += [(273, 4, strip), (277, 3, 1), (278, 3, HEIGHT), (279, 4, WIDTH * HEIGHT)]
+    head = (b"II" if order == "<" else b"MM") + struct.pack(order + "HIH", 42, 8, len(entries))
+    for tag, kind, value in entries:
+        cell = struct.pack(order + ("HH" if kind == 3 else "I"), value, *[0] * (kind == 3))
+        head += struct.pack(order + "HHI", tag, kind, 1) + cell
+    return head + bytes(4) + picture()[:, :, 0].tobytes()
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_a_tiff_with_its_pixels_last(robot, order):
+    data = tiff(order)
+    assert np.array_equal(loaded(store(robot, "x.tif", data))[:, :, 1], picture()[:, :, 0])
+    for length in (*range(len(data) - WIDTH * HEIGHT + 1), len(data) - 500, len(data) - 1):
+        (robot / "images" / "x.tif").write_bytes(data[:length])
+        with pytest.raises(DataError, match=r"x\.tif: not a whole picture: "):
+            image_size(robot / "images" / "x.tif")
 
 
 def test_a_picture_whose_pixels_are_damaged_is_refused_when_loaded(robot):

@@ -52,9 +52,9 @@ def read_image(path: Path) -> Image:
     Raises:
         DataError: unreadable, cut short, or neither 8 nor 16 bits a channel.
     """
-    width, height = image_size(path)
+    image_size(path)
     decoded = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
-    if decoded is None or decoded.shape[:2] != (height, width):
+    if decoded is None:
         raise DataError(f"{path}: not a whole picture: it can't be decoded")
     picture = np.asarray(decoded)
     if picture.dtype == np.uint16:
