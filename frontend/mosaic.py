@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groundfuse.frontend.area_remap import area_remap
-from groundfuse.frontend.arrays import Image, Mask, Picture32
+from groundfuse.frontend.arrays import Image, Mask
 from groundfuse.frontend.exposure_samples import merged, sample_exposure
 from groundfuse.frontend.gains import (
     Exposure,
@@ -193,7 +193,8 @@ def _add_view(stack: TileStack, scene: _Scene, block: tuple[slice, slice], exten
     radius2 = radius_squared(view.camera.intrinsics, found.lattice_px)
     factor = found.spread(np.exp(-scene.exposure.log_factor(extent.view, radius2)))
     fade = found.spread(border_weight(found.lattice_px, view.camera))
-    weight: Picture32 = fade / np.square(np.maximum(found.footprint_cells, np.float32(1.0)))
+    coarseness = np.square(np.maximum(found.footprint_cells, np.float32(1.0)))
+    weight = np.asarray(fade / coarseness, dtype=np.float32)
     offset = part[0].start - block[0].start, part[1].start - block[1].start
     stack.add(offset, found.seen, warped * factor, found.footprint_cells, weight)
 
