@@ -4,7 +4,7 @@ import math
 import zlib
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any, Protocol, TypeVar
 
@@ -13,6 +13,7 @@ import numpy as np
 
 from groundfuse.backend.measurement import FrameId, Reason, Rejected, RelativePose, Se2
 from groundfuse.frontend import paper_matcher, sift_matcher
+from groundfuse.frontend.arrays import Image
 from groundfuse.frontend.consensus import Gate
 from groundfuse.frontend.features import FeatureOptions, Features, detect
 from groundfuse.frontend.fit import Prior
@@ -92,7 +93,17 @@ class FrontEndResult:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Seen:
+class Seen:
+    """A frame as matching sees it.
+
+    Attributes:
+        frame: what is known beforehand.
+        robot: whose frame it is.
+        features: for retrieval and the default matcher.
+        paper: for the paper's matcher, where that is asked for.
+        grey: for the photometric stage, where that is asked for.
+    """
+
     frame: Frame
     robot: Robot
     features: Features
@@ -114,6 +125,14 @@ def in_threads(
     return found
 
 
+def with_matcher(options: FrontEndOptions, matcher: Matcher) -> FrontEndOptions:
+    """Return the options with a matcher and what goes with it: `fast` is ORB plus light."""
+    if matcher is Matcher.FAST:
+        features = replace(options.features, kind="orb")
+        return replace(options, matcher=matcher, features=features, photometric=True)
+    return replace(options, matcher=matcher)
+
+
 def run_front_end(
     robots: Sequence[Robot],
     options: FrontEndOptions,
@@ -125,7 +144,11 @@ def run_front_end(
     frames = [(robot, frame) for robot in robots for frame in robot.frames]
     with stage("features"):
         seen_list = in_threads(
-            lambda item: _look(*item, options), frames, num_workers, progress, "features"
+            lambda item: look(load_image(item[1], item[0].camera), *item, options),
+            frames,
+            num_workers,
+            progress,
+            "features",
         )
     seen = {found.frame.id: found for found in seen_list}
     features = {frame: found.features for frame, found in seen.items()}
@@ -135,7 +158,7 @@ def run_front_end(
         todo = [pair for pair in dict.fromkeys(pairs) if pair not in tried]
         if todo:
             results = in_threads(
-                lambda pair: _compare(seen[pair[0]], seen[pair[1]], options),
+                lambda pair: compare(seen[pair[0]], seen[pair[1]], options),
                 todo,
                 num_workers,
                 progress,
@@ -159,8 +182,8 @@ def run_front_end(
     )
 
 
-def _look(robot: Robot, frame: Frame, options: FrontEndOptions) -> _Seen:
-    image = load_image(frame, robot.camera)
+def look(image: Image, robot: Robot, frame: Frame, options: FrontEndOptions) -> Seen:
+    """Return everything that matching needs to know of one picture."""
     features = detect(image, robot.camera, frame.attitude, frame.sigma, options.features)
     paper = None
     if options.matcher is Matcher.PAPER:
@@ -168,10 +191,11 @@ def _look(robot: Robot, frame: Frame, options: FrontEndOptions) -> _Seen:
     grey = None
     if options.photometric:
         grey = grey_view(image, robot.camera, options.motion.photometric)
-    return _Seen(frame, robot, features, paper, grey)
+    return Seen(frame, robot, features, paper, grey)
 
 
-def _compare(a: _Seen, b: _Seen, options: FrontEndOptions) -> RelativePose | Rejected:
+def compare(a: Seen, b: Seen, options: FrontEndOptions) -> RelativePose | Rejected:
+    """Match two frames and fit the motion between them."""
     rng = np.random.default_rng(_seed(a.frame.id, b.frame.id))
     gate = _odometry_gate(a, b, options)
     if a.paper is not None and b.paper is not None:
@@ -186,7 +210,7 @@ def _compare(a: _Seen, b: _Seen, options: FrontEndOptions) -> RelativePose | Rej
     return result
 
 
-def _view(seen: _Seen) -> View:
+def _view(seen: Seen) -> View:
     prior = Prior(seen.frame.attitude, seen.frame.sigma)
     return View(seen.frame.id, prior, seen.robot.camera.mount.base_from_foot, seen.grey)
 
@@ -196,7 +220,7 @@ def _seed(a: FrameId, b: FrameId) -> list[int]:
     return [zlib.crc32(a.robot.encode()), a.index, zlib.crc32(b.robot.encode()), b.index]
 
 
-def _odometry_gate(a: _Seen, b: _Seen, options: FrontEndOptions) -> Gate | None:
+def _odometry_gate(a: Seen, b: Seen, options: FrontEndOptions) -> Gate | None:
     """Where odometry allows frame b to be, seen from frame a of the same robot."""
     first, last = a.frame.odometry, b.frame.odometry
     if a.robot.name != b.robot.name or first is None or last is None:
@@ -214,7 +238,7 @@ def _odometry_gate(a: _Seen, b: _Seen, options: FrontEndOptions) -> Gate | None:
     return Gate(_foot_motion(a, b, motion), gate * radius_m, gate * turn_rad)
 
 
-def _foot_motion(a: _Seen, b: _Seen, a_from_b: Se2) -> Se2:
+def _foot_motion(a: Seen, b: Seen, a_from_b: Se2) -> Se2:
     """Turn a motion of bases into one of camera feet."""
     mount_a, mount_b = a.robot.camera.mount, b.robot.camera.mount
     return mount_a.base_from_foot.inverse() @ a_from_b @ mount_b.base_from_foot

@@ -20,7 +20,7 @@ from groundfuse.tools.closing_table import closing_table
 from groundfuse.tools.drift_table import drift_record
 from groundfuse.tools.errors import TeamError
 from groundfuse.tools.files import make_folder, write_atomic
-from groundfuse.tools.front_end import Matcher, Result
+from groundfuse.tools.front_end import Matcher, Result, with_matcher
 from groundfuse.tools.outputs import (
     write_graphs,
     write_json,
@@ -147,10 +147,7 @@ def run(asked: argparse.Namespace) -> Fused:
 
 def _options(asked: argparse.Namespace) -> RunOptions:
     base = RunOptions()
-    front_end = base.pipeline.front_end
-    chosen = replace(front_end, matcher=Matcher(asked.matcher))
-    if chosen.matcher is Matcher.FAST:
-        chosen = replace(chosen, features=replace(front_end.features, kind="orb"), photometric=True)
+    chosen = with_matcher(base.pipeline.front_end, Matcher(asked.matcher))
     options = replace(base, pipeline=replace(base.pipeline, front_end=chosen))
     if asked.cell is not None:
         options = with_settings(options, [f"mosaic.m_per_px={asked.cell}"])
