@@ -132,6 +132,17 @@ def test_the_lock_has_hashes_and_no_address():
     assert all("--hash=sha256:" in block for block in pinned)
 
 
+def test_readme_has_the_two_lines_that_ci_and_newcomers_run():
+    """One runs the main job, one the tests; `.ci/run` takes the latter out of README."""
+    pattern = re.search(r"grep -E '([^']+)' README\.md", (ROOT / ".ci" / "run").read_text())
+    assert pattern is not None
+    lines = (ROOT / "README.md").read_text().splitlines()
+    tests = [line for line in lines if re.search(pattern[1], line)]
+    assert tests == ["sh tools/setup.sh && .venv/bin/python -m pytest"]
+    job = "sh tools/setup.sh && .venv/bin/python tools/fuse_team.py --robots A B"
+    assert sum(line == job for line in lines) == 1
+
+
 def test_the_command_is_installed():
     assert find_spec("groundfuse.tools.fuse_team") is not None
     assert (Path(sysconfig.get_path("scripts")) / "fuse-team").exists()

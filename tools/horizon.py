@@ -22,9 +22,9 @@ Rows = NDArray[np.int_]
 
 def border_rays(camera: Camera) -> Points:
     """Return the rays (n, 2) of the border of the used part; nan where a pixel has none."""
-    rays = _rays(camera, _rows(camera))
-    sides = rays[:, [0, -1]].reshape(-1, 2)
-    return np.concatenate([rays[0], rays[-1], sides])
+    rows = _rows(camera)
+    ends = _rays(camera, rows[[0, -1]], NUM_COLUMNS)
+    return np.concatenate([ends.reshape(-1, 2), _rays(camera, rows, 2).reshape(-1, 2)])
 
 
 def check_lens(camera: Camera) -> None:
@@ -37,7 +37,7 @@ def check_lens(camera: Camera) -> None:
     """
     if not np.isnan(border_rays(camera)).any():
         return
-    blind = float(np.isnan(_rays(camera, _rows(camera))[:, :, 0]).mean())
+    blind = float(np.isnan(_rays(camera, _rows(camera), NUM_COLUMNS)[:, :, 0]).mean())
     if blind > MAX_BLIND:
         raise ValueError(
             f"distortion_coefficients can't be undone in {100.0 * blind:.0f} % of the picture, "
@@ -59,7 +59,7 @@ def check_horizon(camera: Camera, attitude: Attitude, border: Points) -> None:
     if not np.isnan(border).any() and not _sky(attitude, border).any():
         return
     rows = _rows(camera)
-    rays = _rays(camera, rows)
+    rays = _rays(camera, rows, NUM_COLUMNS)
     pixels = _sky(attitude, rays.reshape(-1, 2)).reshape(rays.shape[:2])
     sky: Mask = np.logical_or.reduce(pixels, axis=1)
     if not sky.any():
@@ -91,9 +91,9 @@ def _rows(camera: Camera) -> Rows:
     return np.arange(first, last + 1)
 
 
-def _rays(camera: Camera, rows: Rows) -> Points:
+def _rays(camera: Camera, rows: Rows, num_columns: int) -> Points:
     """Return the rays (rows, columns, 2) of evenly spread pixels of the rows, ends included."""
-    columns = np.linspace(0.0, camera.intrinsics.width_px - 1.0, NUM_COLUMNS)
+    columns = np.linspace(0.0, camera.intrinsics.width_px - 1.0, num_columns)
     u, v = np.meshgrid(columns, rows.astype(np.float64))
     rays = camera.intrinsics.rays_from_px(np.stack([u.ravel(), v.ravel()], axis=1))
-    return rays.reshape(len(rows), NUM_COLUMNS, 2)
+    return rays.reshape(len(rows), num_columns, 2)
