@@ -15,7 +15,7 @@ import numpy as np
 from groundfuse.backend.measurement import Attitude, FrameId, Se2
 from groundfuse.frontend.arrays import Mask, Points
 from groundfuse.frontend.camera import Camera
-from groundfuse.frontend.overhead import rays_from_floor
+from groundfuse.frontend.overhead import floor_from_rays, rays_from_floor
 
 RANGE_PER_HEIGHT = math.sqrt(5.0)
 """Farther floor does not count: from there on a pixel is over 1 + 5 = 6 times as long along the
@@ -41,8 +41,8 @@ class View:
 
 
 @functools.lru_cache(maxsize=64)
-def _farthest_ray(camera: Camera) -> float:
-    """Length of the longest ray of the used part's border."""
+def _border_rays(camera: Camera) -> Points:
+    """Rays (n, 2) of the border of the used part that have one."""
     lens = camera.intrinsics
     first, last = camera.used_rows
     u = np.linspace(-0.5, lens.width_px - 0.5, BORDER_POINTS)
@@ -50,7 +50,25 @@ def _farthest_ray(camera: Camera) -> float:
     sides = [(u, np.full_like(u, row)) for row in (v[0], v[-1])]
     sides += [(np.full_like(v, column), v) for column in (u[0], u[-1])]
     rays = lens.rays_from_px(np.vstack([np.column_stack(side) for side in sides]))
-    return float(np.nanmax(np.hypot(rays[:, 0], rays[:, 1])))
+    return rays[np.isfinite(rays).all(axis=1)]
+
+
+def _farthest_ray(camera: Camera) -> float:
+    return float(np.hypot(*_border_rays(camera).T).max())
+
+
+def _box(view: View) -> tuple[Points, Points]:
+    """Lowest and highest x, y (2,) of the world that a view may count."""
+    reach = RANGE_PER_HEIGHT * view.attitude.height_m
+    border = floor_from_rays(view.attitude, _border_rays(view.camera))
+    foot = view.world_from_foot
+    middle = np.array([foot.x_m, foot.y_m])
+    if np.isnan(border).any() or len(border) < 4 * BORDER_POINTS:
+        return middle - reach, middle + reach
+    corners = foot.apply(border)
+    slack = 0.05 * reach  # the border bulges between its points
+    low, high = corners.min(axis=0) - slack, corners.max(axis=0) + slack
+    return np.maximum(low, middle - reach), np.minimum(high, middle + reach)
 
 
 def in_view(view: View, points_m: Points) -> Mask:
@@ -71,47 +89,34 @@ def in_view(view: View, points_m: Points) -> Mask:
 
 
 @functools.lru_cache(maxsize=4096)
-def counted_floor(view: View) -> Points:
+def counted_floor(view: View, step_per_height: float = STEP_PER_HEIGHT) -> Points:
     """Return the grid points (n, 2) of the world that a view shows, metres."""
-    height = view.attitude.height_m
-    step, foot = STEP_PER_HEIGHT * height, view.world_from_foot
-    reach = RANGE_PER_HEIGHT * height
+    step = step_per_height * view.attitude.height_m
+    low, high = _box(view)
     x, y = (
-        step * np.arange(math.ceil((at - reach) / step), math.floor((at + reach) / step) + 1)
-        for at in (foot.x_m, foot.y_m)
+        step * np.arange(math.ceil(least / step), math.floor(most / step) + 1)
+        for least, most in zip(low, high, strict=True)
     )
     grid: Points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2).astype(np.float64)
     return grid[in_view(view, grid)]
 
 
-def _area_m2(view: View) -> float:
-    return len(counted_floor(view)) * (STEP_PER_HEIGHT * view.attitude.height_m) ** 2
-
-
-def true_overlap(a: View, b: View) -> float:
+def true_overlap(a: View, b: View, step_per_height: float = STEP_PER_HEIGHT) -> float:
     """Return the floor that two views share over the smaller of both footprints, 0 to 1.
 
     The same either way round; counted on the grid of the lower camera.
     """
-    apart = np.hypot(
-        a.world_from_foot.x_m - b.world_from_foot.x_m, a.world_from_foot.y_m - b.world_from_foot.y_m
-    )
-    if apart >= RANGE_PER_HEIGHT * (a.attitude.height_m + b.attitude.height_m):
+    (low_a, high_a), (low_b, high_b) = _box(a), _box(b)
+    if (low_a > high_b).any() or (low_b > high_a).any():
         return 0.0
     lower, higher = sorted((a, b), key=lambda view: view.attitude.height_m)
-    smaller = min(_area_m2(a), _area_m2(b))
+    counted, other = (counted_floor(view, step_per_height) for view in (lower, higher))
+    # In squares of the lower camera's grid:
+    scale = (higher.attitude.height_m / lower.attitude.height_m) ** 2
+    smaller = min(float(len(counted)), len(other) * scale)
     if smaller == 0.0:
         return 0.0
-    if _are_apart(counted_floor(lower), counted_floor(higher)):
-        return 0.0
-    step = STEP_PER_HEIGHT * lower.attitude.height_m
-    shared = np.count_nonzero(in_view(higher, counted_floor(lower))) * step**2
-    return min(1.0, float(shared) / smaller)
-
-
-def _are_apart(a_m: Points, b_m: Points) -> bool:
-    """Whether the boxes around two sets of points have a gap between them."""
-    return bool((a_m.min(0) > b_m.max(0)).any() or (b_m.min(0) > a_m.max(0)).any())
+    return min(1.0, float(np.count_nonzero(in_view(higher, counted))) / smaller)
 
 
 def all_overlaps(views: Mapping[FrameId, View]) -> dict[tuple[FrameId, FrameId], float]:

@@ -12,10 +12,10 @@ import numpy as np
 from groundfuse.backend.measurement import IDENTITY, Se2
 from groundfuse.frontend.arrays import Floats
 from groundfuse.frontend.camera import Camera
-from groundfuse.tools.overlap import View, counted_floor, true_overlap
+from groundfuse.tools.overlap import STEP_PER_HEIGHT, View, counted_floor, true_overlap
 from groundfuse.tools.world import RobotSpec
 
-STEP_PER_HEIGHT = 0.48
+WAY_PER_HEIGHT = 0.48
 """Way between two pictures; with a field of view near 60 deg neighbours share about half."""
 LAST_GAP = 0.6  # of a step: what is missing to the start after the last picture
 VIEWS_PER_LAP = 26  # at least, in a planned team: a long way comes back to floor it has seen
@@ -28,6 +28,7 @@ PLACES = (2, 3)
 TRIES = 1000
 VERIFIED = 20
 NEAR_PER_HEIGHT = 0.65
+COARSE_PER_HEIGHT = 0.05  # grid on which starts are compared
 
 
 def loop(num_views: int, step_m: float, rng: np.random.Generator, laps: int = 1) -> tuple[Se2, ...]:
@@ -84,7 +85,7 @@ def plan_team(
         cameras: names and cameras, in order.
         num_views: of each robot.
         rng: source of chance.
-        step_m: way between pictures; by default STEP_PER_HEIGHT of each robot's camera height.
+        step_m: way between pictures; by default WAY_PER_HEIGHT of each robot's camera height.
 
     Raises:
         ValueError: as `loop`.
@@ -93,7 +94,7 @@ def plan_team(
     for name, camera in cameras:
         height = camera.mount.attitude.height_m
         laps = max(1, num_views // VIEWS_PER_LAP)
-        poses = loop(num_views, step_m or STEP_PER_HEIGHT * height, rng, laps)
+        poses = loop(num_views, step_m or WAY_PER_HEIGHT * height, rng, laps)
         start = Se2(0.0, 0.0, float(rng.uniform(-math.pi, math.pi)))
         if team:
             start = _meeting_start(team, camera, poses, rng)
@@ -119,7 +120,7 @@ def _meeting_start(
         if most >= 0 and not likely:
             continue
         views = _views(partner.camera, partner.world_from_base), _views(camera, mine)
-        pairs = meetings(*views)
+        pairs = meetings(*views, COARSE_PER_HEIGHT)
         places = count_places(pairs, lengths)
         if places in PLACES and len(pairs) <= len(poses):
             return start
@@ -160,13 +161,15 @@ def _views(camera: Camera, poses: Sequence[Se2]) -> list[View]:
     return [View(camera, camera.mount.attitude, pose) for pose in poses]
 
 
-def meetings(a: Sequence[View], b: Sequence[View]) -> list[tuple[int, int]]:
+def meetings(
+    a: Sequence[View], b: Sequence[View], step_per_height: float = STEP_PER_HEIGHT
+) -> list[tuple[int, int]]:
     """Return the index pairs of two robots' views that share at least MIN_OVERLAP."""
     return [
         (i, j)
         for i, view_a in enumerate(a)
         for j, view_b in enumerate(b)
-        if true_overlap(view_a, view_b) >= MIN_OVERLAP
+        if true_overlap(view_a, view_b, step_per_height) >= MIN_OVERLAP
     ]
 
 

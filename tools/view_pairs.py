@@ -12,7 +12,7 @@ from groundfuse.tools.photometry import Photometry
 from groundfuse.tools.render import World
 from groundfuse.tools.world import RenderedFrame, take, wobbled
 
-TRIES = 400
+TRIES = 200
 PLACE_PER_HEIGHT = 3.0
 """Views a lie within this many heights of the origin both ways: many pairs share drawn floor."""
 
@@ -30,6 +30,12 @@ class PairOptions:
     least_overlap: float = 0.3
     most_overlap: float = 0.8
     max_turn_rad: float = math.pi
+
+    def __post_init__(self) -> None:
+        """Refuse limits that no pair can keep (ValueError)."""
+        if not 0.0 <= self.least_overlap <= self.most_overlap <= 1.0:
+            found = f"{self.least_overlap:g} to {self.most_overlap:g}"
+            raise ValueError(f"overlaps must lie within 0 to 1 and in order, got {found}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
