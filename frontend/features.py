@@ -5,11 +5,13 @@ stride; the local contrast normalisation makes low-contrast floors usable; a den
 keeps the near, finely resolved part of the picture from taking all features.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from groundfuse.backend.measurement import Attitude
 from groundfuse.frontend.arrays import Floats, Image, Mask, Points
@@ -23,6 +25,9 @@ from groundfuse.frontend.overhead_view import (
     overhead_view,
 )
 from groundfuse.frontend.repetition import repetition
+
+SURPLUS = 1.6
+"""Features described per feature kept: the strongest anywhere, then spread over the floor."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -135,27 +140,30 @@ def _found(
     inner = cv2.erode(mask.astype(np.uint8), np.ones((9, 9), np.uint8), borderValue=0)
     if options.kind == "orb":
         orb = cv2.ORB.create(nfeatures=4 * wanted + 1, fastThreshold=10, nlevels=4)
-        kept = _spread(list(orb.detect(flat, inner)), wanted, options.cell_px)
+        many = orb.detect(flat, inner)
+        kept = [many[i] for i in _spread(many, wanted, options.cell_px)]
         found, bits = orb.compute(flat, kept)
         return list(found), np.zeros((0, 32), np.uint8) if bits is None else bits
+    # Describing a surplus costs less than building the pyramid a second time for the chosen ones.
     sift = cv2.SIFT.create(
-        nfeatures=0,
+        nfeatures=round(SURPLUS * wanted),
         contrastThreshold=options.contrast_threshold,
         edgeThreshold=10,
         enable_precise_upscale=True,
     )
-    kept = _spread(list(sift.detect(flat, inner)), wanted, options.cell_px)
-    found, described = sift.compute(flat, kept)
+    many, described = sift.detectAndCompute(flat, inner)
     if described is None:
         return [], np.zeros((0, 128), np.float32)
-    root = np.sqrt(described / np.maximum(described.sum(axis=1, keepdims=True), 1e-9))
-    return list(found), root.astype(np.float32)
+    chosen = _spread(many, wanted, options.cell_px)
+    rows = described[chosen].astype(np.float32)
+    root = np.sqrt(rows / np.maximum(rows.sum(axis=1, keepdims=True), 1e-9))
+    return [many[i] for i in chosen], root
 
 
-def _spread(keypoints: list[cv2.KeyPoint], wanted: int, cell_px: int) -> list[cv2.KeyPoint]:
-    """Keep the strongest of every cell in turn, so that all of the floor is covered."""
+def _spread(keypoints: Sequence[cv2.KeyPoint], wanted: int, cell_px: int) -> NDArray[np.int64]:
+    """Choose the strongest of every cell in turn, so that all of the floor is covered."""
     if len(keypoints) <= wanted:
-        return keypoints
+        return np.arange(len(keypoints))
     points = np.array([k.pt for k in keypoints])
     response = np.array([k.response for k in keypoints])
     cell = (points // cell_px).astype(np.int64)
@@ -164,7 +172,7 @@ def _spread(keypoints: list[cv2.KeyPoint], wanted: int, cell_px: int) -> list[cv
     starts = np.flatnonzero(np.r_[True, key[order][1:] != key[order][:-1]])
     place = np.arange(len(order)) - np.repeat(starts, np.diff(np.r_[starts, len(order)]))
     chosen = order[np.lexsort((-response[order], place))[:wanted]]
-    return [keypoints[i] for i in np.sort(chosen)]
+    return np.sort(chosen)
 
 
 def _sigma(
