@@ -2,11 +2,13 @@
 
 import argparse
 import logging
+import math
 import os
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NoReturn
 
 # Threads work on frames and pairs; a second layer of them inside numpy would only get in the way.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -28,7 +30,11 @@ from groundfuse.tools.outputs import (
     write_poses,
     write_trajectories,
 )
-from groundfuse.tools.pictures import write_mosaics
+from groundfuse.tools.pictures import (
+    write_location_graphs,
+    write_mosaics,
+    write_overheads,
+)
 from groundfuse.tools.pipeline import (
     Fused,
     PipelineOptions,
@@ -52,21 +58,25 @@ frames.csv (times, attitudes, odometry) and groundtruth.tum (for scoring only).
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RunOptions:
+class RunOptions(PipelineOptions):
     """What a run is asked for; written to the out folder as options.json.
 
     Attributes:
-        pipeline: pictures to poses.
         mosaic: poses to a picture of the floor.
     """
 
-    pipeline: PipelineOptions = field(default_factory=PipelineOptions)
     mosaic: MosaicOptions = field(default_factory=MosaicOptions)
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        """Say what is wrong in one line."""
+        self.exit(2, f"fuse_team: {message}\n")
 
 
 def parser() -> argparse.ArgumentParser:
     """Return the command line."""
-    command = argparse.ArgumentParser(
+    command = _Parser(
         prog="fuse_team.py",
         description="Fuse the photographs of a team of ground robots into one metric floor map.",
         epilog=EPILOG,
@@ -87,6 +97,7 @@ def parser() -> argparse.ArgumentParser:
     add("--no-bundle", action="store_true", help="stop at the Pose2 graph")
     add("--no-mosaic", action="store_true", help="leave out mosaic, location graph and 3D file")
     add("--cell", type=float, metavar="METRES", help="side of a mosaic cell (from the pictures)")
+    add("--overhead", action="store_true", help="write every picture's overhead view too")
     add("--check", action="store_true", help="second opinion: optimise the graph with Open3D too")
     add("--view", action="store_true", help="show the map in an Open3D window at the end")
     add(
@@ -124,9 +135,7 @@ def run(asked: argparse.Namespace) -> Fused:
         out = make_folder(asked.out)
         write_json(out / "options.json", record(options))
     bar = _Bar(asked.quiet)
-    fused = fuse_robots(
-        robots, options.pipeline, asked.workers, bar, watch, bundled=not asked.no_bundle
-    )
+    fused = fuse_robots(robots, options, asked.workers, bar, watch, bundled=not asked.no_bundle)
     drift = drift_record(fused)
     with watch.stage("writing"):
         write_pairs(out, fused)
@@ -135,24 +144,33 @@ def run(asked: argparse.Namespace) -> Fused:
         write_trajectories(out, fused)
         write_json(out / "drift.json", drift)
     notes: list[str] = []
-    if not asked.no_mosaic:
-        write_mosaics(out, fused, options.mosaic, asked.workers, watch, quiet=asked.quiet)
-    table = closing_table(fused, drift, watch.seconds)
-    table += "".join(f"{note}\n" for note in notes)
-    write_atomic(out / "report.txt", table)
-    print(table, end="")
+    try:
+        if not asked.no_mosaic:
+            quiet = asked.quiet
+            mosaics = write_mosaics(out, fused, options.mosaic, asked.workers, watch, quiet=quiet)
+            with watch.stage("drawing"):
+                write_location_graphs(out, fused, mosaics)
+        if asked.overhead:
+            with watch.stage("overhead"):
+                write_overheads(out, fused, options.front_end.features.overhead)
+    finally:  # a picture that fails late doesn't cost the numbers
+        table = closing_table(fused, drift, watch.seconds)
+        table += "".join(f"{note}\n" for note in notes)
+        write_atomic(out / "report.txt", table)
+        print(table, end="")
     print(f"everything is in {out}")
     return fused
 
 
 def _options(asked: argparse.Namespace) -> RunOptions:
     base = RunOptions()
-    chosen = with_matcher(base.pipeline.front_end, Matcher(asked.matcher))
-    options = replace(base, pipeline=replace(base.pipeline, front_end=chosen))
+    chosen = with_matcher(base.front_end, Matcher(asked.matcher))
+    options = replace(base, front_end=chosen)
     if asked.cell is not None:
-        options = with_settings(options, [f"mosaic.m_per_px={asked.cell}"])
-    short = [s if s.startswith("mosaic.") else f"pipeline.{s}" for s in asked.set]
-    return with_settings(options, short)
+        if not 0.0 < asked.cell < math.inf:
+            raise TeamError(f"--cell must be positive, got {asked.cell:g}")
+        options = replace(options, mosaic=replace(options.mosaic, m_per_px=asked.cell))
+    return with_settings(options, asked.set)
 
 
 class _Bar:
@@ -163,7 +181,7 @@ class _Bar:
 
     def __call__(self, items: Iterable[Result], total: int, title: str) -> Iterable[Result]:
         bar: Iterable[Result] = tqdm(
-            items, total=total, desc=f"{title:<10}", disable=self._quiet, leave=False
+            items, total=total, desc=f"{title:<10}", disable=self._quiet or None, leave=False
         )
         return bar
 
