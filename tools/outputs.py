@@ -17,13 +17,15 @@ from groundfuse.backend.measurement import (
     TeamEstimate,
 )
 from groundfuse.backend.trajectory import tum_text
+from groundfuse.frontend.decomposition import gamma
 from groundfuse.tools.files import write_atomic
 from groundfuse.tools.pipeline import Fused, accepted_edges, turned_down
 
 SIGMAS = ("sigma_x_m", "sigma_y_m", "sigma_theta_deg")
 POSE = ("x_m", "y_m", "theta_deg", *SIGMAS)
 VERDICT = ("a", "b", "verdict", "reason", "value", "limit")
-PAIR_COLUMNS = (*VERDICT, *POSE, "inliers", "ambiguity", "chi2")
+GAMMA = ("rho_m", "phi1_deg", "phi2_deg")  # the paper's relative location, eq. 18
+PAIR_COLUMNS = (*VERDICT, *POSE, *GAMMA, "inliers", "ambiguity", "chi2")
 POSE_COLUMNS = ("robot", "index", "image", "component", *POSE)
 
 
@@ -65,12 +67,14 @@ def _accepted_row(
     sigma = [math.sqrt(c[0, 0]), math.sqrt(c[1, 1]), math.degrees(math.sqrt(c[2, 2]))]
     pose = [z.x_m, z.y_m, math.degrees(z.theta_rad)]
     found = [edge.num_inliers, edge.ambiguity, chi2.get((edge.a, edge.b))]
-    return [edge.a, edge.b, *verdict, *pose, *sigma, *found]
+    seen = gamma(z)
+    bearings = [seen.rho_m, math.degrees(seen.phi1_rad), math.degrees(seen.phi2_rad)]
+    return [edge.a, edge.b, *verdict, *pose, *sigma, *bearings, *found]
 
 
 def _rejected_row(rejected: Rejected) -> list[Any]:
     reason = [rejected.reason.value, float(rejected.value), float(rejected.limit)]
-    return [rejected.a, rejected.b, "rejected", *reason, *[None] * 9]
+    return [rejected.a, rejected.b, "rejected", *reason, *[None] * 12]
 
 
 def write_graphs(out: Path, fused: Fused) -> None:

@@ -1,6 +1,6 @@
 """Pictures of the fused team: mosaics with world files, their layers, the location graph, 3D."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +11,8 @@ from tqdm import tqdm
 from groundfuse.backend.measurement import FrameId
 from groundfuse.frontend.arrays import Image
 from groundfuse.frontend.mosaic import Mosaic, MosaicOptions, MosaicView, build_mosaic
+from groundfuse.frontend.overhead_view import OverheadOptions, overhead_grid, overhead_view
+from groundfuse.tools.drawing import draw_location_graph
 from groundfuse.tools.errors import TeamError
 from groundfuse.tools.files import write_atomic
 from groundfuse.tools.outputs import component_name
@@ -62,6 +64,25 @@ def _views(fused: Fused, component: int) -> list[MosaicView]:
         for frame, pose in sorted(best.team_from_base.items())
         if best.component_of[frame] == component
     ]
+
+
+def write_location_graphs(out: Path, fused: Fused, mosaics: Mapping[int, Mosaic]) -> None:
+    """Write a picture of every component's trajectories and edges over its mosaic."""
+    feet = {robot.name: robot.camera.mount.base_from_foot for robot in fused.robots}
+    edges = [*fused.edges, *fused.front_end.rejected]
+    for component, mosaic in mosaics.items():
+        picture = draw_location_graph(mosaic, fused.best, edges, component, feet)
+        write_png(out / f"{component_name('location_graph', component)}.png", picture)
+
+
+def write_overheads(out: Path, fused: Fused, options: OverheadOptions) -> None:
+    """Write every frame's overhead view (paper eq. 1) at its best known attitude, forward up."""
+    for frame, (robot, known) in sorted(fused.frames.items()):
+        attitude = fused.attitude(frame)
+        grid = overhead_grid(robot.camera, attitude, options)
+        image = load_image(known, robot.camera)
+        view, _ = overhead_view(image, robot.camera, attitude, grid)
+        write_png(out / "overhead" / f"{frame}.png", view)
 
 
 def _write_layers(out: Path, stem: str, mosaic: Mosaic) -> None:
