@@ -66,7 +66,7 @@ class Gate(NamedTuple):
 
     Attributes:
         a_from_b: expected motion, foot to foot.
-        radius_m: largest distance from it, at the centre of view b.
+        radius_m: largest distance of foot b from where it is expected.
         turn_rad: largest turn from it.
     """
 
@@ -115,7 +115,9 @@ def find_modes(
     centre = np.median(found.floor_b, axis=0)
     if gate is not None:
         far, turn = _apart(hypotheses, _coefficients(gate.a_from_b), centre)
-        hypotheses = hypotheses[(far <= gate.radius_m) & (turn <= gate.turn_rad)]
+        # Judged at the view's centre, where hypotheses are certain; a turn swings it about foot b.
+        reach = gate.radius_m + turn * np.hypot(*centre)
+        hypotheses = hypotheses[(far <= reach) & (turn <= gate.turn_rad)]
     if len(hypotheses) == 0:
         return []
     hypotheses = hypotheses[: options.max_hypotheses]

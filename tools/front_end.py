@@ -226,14 +226,18 @@ def _odometry_gate(a: Seen, b: Seen, options: FrontEndOptions) -> Gate | None:
     if a.robot.name != b.robot.name or first is None or last is None:
         return None
     low, high = sorted((a.frame.id.index, b.frame.id.index))
-    steps = a.robot.frames[low + 1 : high + 1]
-    sigmas = [frame.odometry.sigma for frame in steps if frame.odometry is not None]
-    if len(sigmas) < len(steps):
-        return None
+    steps = [frame.odometry for frame in a.robot.frames[low + 1 : high + 1]]
+    foot, turn2, place2 = last.map_from_base @ b.robot.camera.mount.base_from_foot, 0.0, 0.0
+    for step in steps:
+        if step is None:
+            return None
+        at, sigma = step.map_from_base, step.sigma
+        # An error of a step's turn swings all that follows about the step's end.
+        lever_m = math.hypot(foot.x_m - at.x_m, foot.y_m - at.y_m)
+        turn2 += sigma.theta_rad**2
+        place2 += sigma.x_m**2 + sigma.y_m**2 + (sigma.theta_rad * lever_m) ** 2
     motion = first.map_from_base.inverse() @ last.map_from_base
-    turn_rad = math.sqrt(sum(s.theta_rad**2 for s in sigmas))
-    path_m = math.hypot(motion.x_m, motion.y_m)
-    radius_m = math.sqrt(sum(s.x_m**2 + s.y_m**2 for s in sigmas)) + turn_rad * path_m
+    turn_rad, radius_m = math.sqrt(turn2), math.sqrt(place2)
     gate = options.odometry_gate_sigmas
     return Gate(_foot_motion(a, b, motion), gate * radius_m, gate * turn_rad)
 
