@@ -2,7 +2,8 @@
 
 import dataclasses
 import enum
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from typing import Any, TypeVar
 
 from groundfuse.tools.checks import nearest
@@ -16,14 +17,33 @@ def with_settings(options: Options, settings: Sequence[str]) -> Options:
 
     Raises:
         TeamError: no `=`, an unknown name (the nearest known one is named), or a value of the
-            wrong type.
+            wrong type; a number must be 0 or above (`inf` switches a limit off), several stand
+            with commas between them.
     """
     for setting in settings:
         name, equals, text = setting.partition("=")
         if not equals:
             raise TeamError(f"--set {setting}: needed STAGE.OPTION=VALUE")
-        options = _replaced(options, name.strip().split("."), text.strip(), name.strip())
+        whole = name.strip()
+        there = [full for full in option_names(options) if _last(full) == _last(whole)]
+        if there and whole not in there:
+            raise TeamError(f"--set {whole}: did you mean {' or '.join(there)}?")
+        options = _replaced(options, whole.split("."), text.strip(), whole)
     return options
+
+
+def option_names(options: object) -> Iterator[str]:
+    """Yield the full name of every option, in the order of the record."""
+    for field in dataclasses.fields(options):  # type: ignore[arg-type]
+        value = getattr(options, field.name)
+        if dataclasses.is_dataclass(value):
+            yield from (f"{field.name}.{name}" for name in option_names(value))
+        else:
+            yield field.name
+
+
+def _last(name: str) -> str:
+    return name.rpartition(".")[2]
 
 
 def _replaced(options: Options, path: Sequence[str], text: str, whole: str) -> Options:
@@ -59,11 +79,23 @@ def _parsed(old: object, text: str, whole: str) -> object:
         if text.lower() not in {"true", "false"}:
             raise TeamError(f"--set {whole}: got {text!r}, needed true or false")
         return text.lower() == "true"
-    kind = float if old is None else type(old)
+    if isinstance(old, str):
+        return text
+    if isinstance(old, tuple):
+        return tuple(_number(word, whole, whole_only=False) for word in text.split(","))
+    return _number(text, whole, whole_only=isinstance(old, int))
+
+
+def _number(text: str, whole: str, *, whole_only: bool) -> float:
+    """Return a number from 0 on."""
+    needed = "a whole number" if whole_only else "a number"
     try:
-        return kind(text)  # type: ignore[call-arg]
-    except (TypeError, ValueError) as error:
-        raise TeamError(f"--set {whole}: got {text!r}, needed a {kind.__name__}") from error
+        number = int(text) if whole_only else float(text)
+    except ValueError as error:
+        raise TeamError(f"--set {whole}: got {text!r}, needed {needed}") from error
+    if number < 0 or math.isnan(number):
+        raise TeamError(f"--set {whole}: got {text!r}, needed {needed} from 0 on")
+    return number
 
 
 def record(options: object) -> Any:  # noqa: ANN401
