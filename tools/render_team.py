@@ -41,7 +41,7 @@ LENSES = (
     Intrinsics(WIDTH, 480, 580.0, 579.0, 324.1, 236.4),
 )  # fmt: skip
 """Lenses dealt out to the robots in turn."""
-PLACES = ((0.15, 0.0, 0.0), (0.22, -0.07, -3.0), (-0.1, 0.1, 7.0), (0.0, 0.0, 0.0))
+PLACES = ((0.15, 0.0, 0.0), (0.22, -0.07, -4.0), (-0.1, 0.1, 7.0), (0.0, 0.0, 0.0))
 """Where the camera sits on its robot in turn: x and y in camera heights, yaw in degrees."""
 SIGMA_PER_HEIGHT = 2e-3 / 0.55
 ROLLS_DEG = (0.4, -0.6, 0.0, 0.2)
@@ -121,8 +121,12 @@ def robot_camera(word: str, index: int, args: argparse.Namespace) -> tuple[str, 
     return name, camera
 
 
-def _scene(args: argparse.Namespace) -> Scene:
-    """Plan everything (ValueError: what can't be)."""
+def plan_scene(args: argparse.Namespace) -> Scene:
+    """Return the floor, the obstacles and every view that the command line asks for.
+
+    Raises:
+        ValueError: what can't be.
+    """
     for name, least in (("views", 1), ("obstacles", 0), ("quality", 1), ("seed", 0)):
         if getattr(args, name) < least:
             raise ValueError(f"--{name} must be at least {least}, got {getattr(args, name)}")
@@ -145,7 +149,7 @@ def render(args: argparse.Namespace) -> None:
         TeamError: what can't be rendered or written.
     """
     try:
-        scene, photometry = _scene(args), Photometry(noise=args.noise)
+        scene, photometry = plan_scene(args), Photometry(noise=args.noise)
     except ValueError as error:
         raise TeamError(str(error)) from error
     for robot in scene.robots:

@@ -18,6 +18,7 @@ from groundfuse.tools.world import RobotSpec
 WAY_PER_HEIGHT = 0.48
 """Way between two pictures; with a field of view near 60 deg neighbours share about half."""
 LAST_GAP = 0.6  # of a step: what is missing to the start after the last picture
+SHORTEST_LAP = 12.6  # steps: tighter turns leave neighbours no common floor
 VIEWS_PER_LAP = 26  # at least, in a planned team: a long way comes back to floor it has seen
 WAVES = {2: 0.08, 3: 0.03}  # relative amplitude of the loop's radius by waves per turn
 HEADING_SIGMA_RAD = math.radians(2.0)
@@ -34,7 +35,8 @@ COARSE_PER_HEIGHT = 0.05  # grid on which starts are compared
 def loop(num_views: int, step_m: float, rng: np.random.Generator, laps: int = 1) -> tuple[Se2, ...]:
     """Return poses of the base around a wavy loop, evenly spaced, looking along the way.
 
-    The first pose is the origin; odd draws run clockwise. Later laps of several run over the same
+    The first pose is the origin; half of the loops run clockwise. Fewer than 13 views end part of
+    the way around. Later laps of several run over the same
     loop, with pictures at other places of it.
 
     Raises:
@@ -44,7 +46,7 @@ def loop(num_views: int, step_m: float, rng: np.random.Generator, laps: int = 1)
         found = f"{num_views} views, {laps} laps, step {step_m:g} m"
         raise ValueError(f"a loop needs views, laps and a step above 0, got {found}")
     along, curve = _closed_curve(rng)
-    round_trip = step_m * (num_views - 1 + LAST_GAP) / laps
+    round_trip = step_m * max((num_views - 1 + LAST_GAP) / laps, SHORTEST_LAP)
     at = (np.arange(num_views) * step_m / round_trip) % 1.0 * along[-1]
     x, y = (np.interp(at, along, axis) for axis in curve.T)
     ahead = np.gradient(curve, along, axis=0)
