@@ -74,6 +74,8 @@ def test_every_team_is_read(real):
 def test_the_reference_agrees_with_its_own_columns(real):
     """Tilt and picture-up stand in the reference too, to 5e-4 deg: worst seen 5.5e-4."""
     robot = read_team(real / "seneca", ["A"])[0]
+    lens = robot.camera.intrinsics
+    assert (lens.cx_px, lens.cy_px) == (449.5, 337.0)  # its pixels begin at 0, ours at -0.5
     assert robot.truth is not None
     with (REAL / "seneca" / "ref_poses_colmap.csv").open() as stream:
         columns = {row["file"]: row for row in csv.DictReader(stream)}
