@@ -31,7 +31,9 @@ class FrameId:
     index: int
 
     def __str__(self) -> str:
-        return f"{self.robot}{self.index}"
+        """Return A11, or r1.1 where the robot's name ends like a number: no two frames share it."""
+        dot = "." if self.robot[-1:].isdecimal() or self.robot[-1:] == "." else ""
+        return f"{self.robot}{dot}{self.index}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ from typing import Any
 
 from groundfuse.backend.bundle_estimate import BundleEstimate, BundleRefusal
 from groundfuse.backend.measurement import Anchor, Reason
-from groundfuse.tools.pipeline import Fused, turned_down
+from groundfuse.tools.pipeline import Fused, bundle_rejected, turned_down
 
 
 def closing_table(fused: Fused, drift: Mapping[str, Any], seconds: Mapping[str, float]) -> str:
@@ -105,6 +105,7 @@ def _pair_lines(fused: Fused) -> list[str]:
     down = turned_down(fused.team)
     reasons = Counter(r.reason.value for r in rejected)
     reasons.update(f"{r.reason.value} in the graph" for r in down)
+    reasons.update(f"{r.reason.value} in the bundle" for r in bundle_rejected(fused))
     lines += [f"  {reason:<24} {number:5d}" for reason, number in sorted(reasons.items())]
     freedom = fused.team.degrees_of_freedom
     if freedom > 0:

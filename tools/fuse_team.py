@@ -24,6 +24,7 @@ from groundfuse.tools.errors import TeamError
 from groundfuse.tools.files import make_folder, write_atomic
 from groundfuse.tools.front_end import Matcher, Result, with_matcher
 from groundfuse.tools.outputs import (
+    check_names,
     write_graphs,
     write_json,
     write_pairs,
@@ -132,6 +133,7 @@ def run(asked: argparse.Namespace) -> Fused:
     watch = Stopwatch()
     with watch.stage("reading"):
         robots = read_team(asked.team, asked.robots or list_robots(asked.team))
+        check_names(robot.name for robot in robots)
         out = make_folder(asked.out)
         write_json(out / "options.json", record(options))
     bar = _Bar(asked.quiet)

@@ -4,12 +4,14 @@ import csv
 import io
 import json
 import math
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 from groundfuse.backend import g2o
 from groundfuse.backend.measurement import (
+    EdgeVerdict,
     FrameId,
     Rejected,
     RelativePose,
@@ -18,8 +20,9 @@ from groundfuse.backend.measurement import (
 )
 from groundfuse.backend.trajectory import tum_text
 from groundfuse.frontend.decomposition import gamma
+from groundfuse.tools.errors import TeamError
 from groundfuse.tools.files import write_atomic
-from groundfuse.tools.pipeline import Fused, accepted_edges, turned_down
+from groundfuse.tools.pipeline import Fused, accepted_edges, bundle_rejected, used_edges
 
 SIGMAS = ("sigma_x_m", "sigma_y_m", "sigma_theta_deg")
 POSE = ("x_m", "y_m", "theta_deg", *SIGMAS)
@@ -27,6 +30,18 @@ VERDICT = ("a", "b", "verdict", "reason", "value", "limit")
 GAMMA = ("rho_m", "phi1_deg", "phi2_deg")  # the paper's relative location, eq. 18
 PAIR_COLUMNS = (*VERDICT, *POSE, *GAMMA, "inliers", "ambiguity", "chi2")
 POSE_COLUMNS = ("robot", "index", "image", "component", *POSE)
+
+
+def check_names(robots: Iterable[str]) -> None:
+    """Refuse robots whose files would overwrite others' (TeamError)."""
+    names = sorted(robots)
+    for name in names:
+        for other in ("team", *names):
+            parts = rf"{re.escape(other)}(_chained|_groundtruth)?(_\d+)?"
+            if re.fullmatch(parts, name) and (name != other or other == "team"):
+                raise TeamError(
+                    f"robot {name!r}: its files would be taken for {other}'s, rename it"
+                )
 
 
 def csv_text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
@@ -46,9 +61,10 @@ def _word(value: object) -> str:
 
 def write_pairs(out: Path, fused: Fused) -> None:
     """Write pairs.csv: every pair that was tried, with its verdict and its numbers."""
-    down = {(r.a, r.b): r for r in turned_down(fused.team)}
-    chi2 = {(v.a, v.b): v.chi2 for v in fused.team.verdicts}
-    rows = [_accepted_row(e, down.get((e.a, e.b)), chi2) for e in fused.front_end.edges]
+    late = {(r.a, r.b): r for r in bundle_rejected(fused)}
+    # The verdicts are in the order of the edges: the front-end's come first, odometry's follow.
+    edges = zip(fused.front_end.edges, fused.team.verdicts, strict=False)
+    rows = [_accepted_row(e, v, late.get((e.a, e.b))) for e, v in edges]
     rows += [_rejected_row(r) for r in fused.front_end.rejected]
     write_atomic(out / "pairs.csv", csv_text(PAIR_COLUMNS, sorted(rows, key=_pair_order)))
 
@@ -57,16 +73,16 @@ def _pair_order(row: Sequence[Any]) -> tuple[FrameId, FrameId]:
     return row[0], row[1]
 
 
-def _accepted_row(
-    edge: RelativePose, down: Rejected | None, chi2: dict[tuple[FrameId, FrameId], float]
-) -> list[Any]:
+def _accepted_row(edge: RelativePose, graph: EdgeVerdict, late: Rejected | None) -> list[Any]:
     z, c = edge.a_from_b, edge.covariance
     verdict: list[Any] = ["used", None, None, None]
-    if down is not None:
-        verdict = ["turned_down", down.reason.value, down.value, down.limit]
+    if graph.reason is not None:
+        verdict = ["turned_down", graph.reason.value, graph.chi2, graph.limit]
+    elif late is not None:
+        verdict = ["turned_down", late.reason.value, late.value, late.limit]
     sigma = [math.sqrt(c[0, 0]), math.sqrt(c[1, 1]), math.degrees(math.sqrt(c[2, 2]))]
     pose = [z.x_m, z.y_m, math.degrees(z.theta_rad)]
-    found = [edge.num_inliers, edge.ambiguity, chi2.get((edge.a, edge.b))]
+    found = [edge.num_inliers, edge.ambiguity, graph.chi2]
     seen = gamma(z)
     bearings = [seen.rho_m, math.degrees(seen.phi1_rad), math.degrees(seen.phi2_rad)]
     return [edge.a, edge.b, *verdict, *pose, *sigma, *bearings, *found]
@@ -82,7 +98,7 @@ def write_graphs(out: Path, fused: Fused) -> None:
     for name, alone in fused.alone.items():
         inner = [e for e in fused.edges if e.a.robot == e.b.robot == name]
         _write_components(out, name, alone.optimised, accepted_edges(alone.optimised, inner))
-    _write_components(out, "team", fused.best, accepted_edges(fused.team, fused.edges))
+    _write_components(out, "team", fused.best, used_edges(fused))
 
 
 def _write_components(

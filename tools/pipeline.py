@@ -152,6 +152,18 @@ def turned_down(team: TeamEstimate) -> list[Rejected]:
     ]
 
 
+def bundle_rejected(fused: Fused) -> tuple[Rejected, ...]:
+    """Return the pairs that the graph accepted and the bundle turned down."""
+    return fused.bundled.rejected if isinstance(fused.bundled, BundleEstimate) else ()
+
+
+def used_edges(fused: Fused) -> list[RelativePose]:
+    """Return the edges that the best solution rests on."""
+    late = {(r.a, r.b) for r in bundle_rejected(fused)}
+    accepted = accepted_edges(fused.team, fused.edges)
+    return [e for e in accepted if e.correspondences is None or (e.a, e.b) not in late]
+
+
 def _bundled(
     robots: Sequence[Robot],
     team: TeamEstimate,
