@@ -114,10 +114,7 @@ def find_modes(
     hypotheses = _drawn(found, tolerance_m, max_log_scale, options, rng)
     centre = np.median(found.floor_b, axis=0)
     if gate is not None:
-        far, turn = _apart(hypotheses, _coefficients(gate.a_from_b), centre)
-        # Judged at the view's centre, where hypotheses are certain; a turn swings it about foot b.
-        reach = gate.radius_m + turn * np.hypot(*centre)
-        hypotheses = hypotheses[(far <= reach) & (turn <= gate.turn_rad)]
+        hypotheses = hypotheses[_within(gate, hypotheses, found.floor_b, tolerance_m)]
     if len(hypotheses) == 0:
         return []
     hypotheses = hypotheses[: options.max_hypotheses]
@@ -127,8 +124,13 @@ def find_modes(
     while len(hypotheses) and len(modes) < options.num_modes:
         start = hypotheses[int(np.argmax(votes))]
         best, count = _refined(found, start, tolerance_m, max_log_scale, options)
-        # A start on the slope of a known mode climbs back to it: no rival.
-        if all(_distinct(other[None], best, centre, tolerance_m, options)[0] for other in motions):
+        # A start on the slope of a known mode climbs back to it: no rival. One at the edge of the
+        # gate may climb out of it.
+        known = any(
+            not _distinct(other[None], best, centre, tolerance_m, options)[0] for other in motions
+        )
+        inside = gate is None or _within(gate, best[None], found.floor_b, tolerance_m)[0]
+        if inside and not known:
             motions.append(best)
             modes.append(_mode(found, best, count, tolerance_m, options))
         apart = _distinct(hypotheses, best, centre, tolerance_m, options)
@@ -178,7 +180,8 @@ def _drawn(
         agree &= ~(error > options.max_turn_rad)
     keep = np.flatnonzero(agree)
     one, two, turn = one[keep], two[keep], turn[keep]
-    scale = np.ones(len(keep)) if max_log_scale == 0.0 else length_a[keep] / length_b[keep]
+    ratio = np.log(length_a[keep] / length_b[keep])
+    scale = np.exp(np.clip(ratio, -max_log_scale, max_log_scale))
     c, s = scale * np.cos(turn), scale * np.sin(turn)
     middle_a = (found.floor_a[one] + found.floor_a[two]) / 2.0
     middle_b = (found.floor_b[one] + found.floor_b[two]) / 2.0
@@ -269,6 +272,18 @@ def _apart(motions: Floats, other: Floats, centre: Floats) -> tuple[Floats, Floa
     dy = change[:, 1] * centre[0] + change[:, 0] * centre[1] + change[:, 3]
     turn = np.arctan2(motions[:, 1], motions[:, 0]) - np.arctan2(other[1], other[0])
     return np.hypot(dx, dy), np.abs(np.remainder(turn + np.pi, 2 * np.pi) - np.pi)
+
+
+def _within(gate: Gate, motions: Floats, floor_b: Points, tolerance_m: float) -> Mask:
+    """Which motions (m, 4) a gate allows, give or take the tolerance that wobble needs.
+
+    Judged at the view's centre, where a motion is known best; a turn swings it about foot b.
+    """
+    centre = np.median(floor_b, axis=0)
+    size = np.sqrt(((floor_b - centre) ** 2).sum(axis=1).mean())
+    far, turn = _apart(motions, _coefficients(gate.a_from_b), centre)
+    near: Mask = far <= gate.radius_m + turn * np.hypot(*centre) + tolerance_m
+    return near & (turn <= gate.turn_rad + tolerance_m / max(size, tolerance_m))
 
 
 def _distinct(

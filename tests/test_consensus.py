@@ -1,0 +1,252 @@
+"""The consensus: the planted motion wins, its rivals are seen, and every option does its work."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from floor_pairs import error_of
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from groundfuse.backend.measurement import IDENTITY, Se2
+from groundfuse.frontend.consensus import (
+    Candidates,
+    ConsensusOptions,
+    Gate,
+    find_modes,
+    one_to_one,
+)
+
+TOLERANCE_M = 0.01
+OPTIONS = ConsensusOptions(num_draws=8000)
+TRUTH = Se2(0.3, -0.2, 2.0)
+
+
+def planted(rng, motions=(TRUTH,), right=40, wrong=120, scale=1.0, noise_m=0.002, size_m=0.4):
+    """Features of b, each with one right candidate per motion and some wrong ones, shuffled."""
+    in_b = rng.uniform(-size_m, size_m, (right, 2))
+    floor_a, floor_b, index_a, index_b, rank, turn = [], [], [], [], [], []
+    for k, motion in enumerate(motions):
+        floor_a.append(motion.apply(scale * in_b) + noise_m * rng.standard_normal((right, 2)))
+        floor_b.append(in_b)
+        index_a.append(np.arange(right) + k * right)
+        index_b.append(np.arange(right))
+        rank.append(np.zeros(right, dtype=int))
+        turn.append(np.full(right, motion.theta_rad) + 0.05 * rng.standard_normal(right))
+    floor_a.append(rng.uniform(-size_m, size_m, (wrong, 2)))
+    floor_b.append(rng.uniform(-size_m, size_m, (wrong, 2)))
+    index_a.append(len(motions) * right + np.arange(wrong))
+    index_b.append(right + np.arange(wrong))
+    rank.append(np.ones(wrong, dtype=int))
+    turn.append(rng.uniform(-math.pi, math.pi, wrong))
+    return Candidates(
+        np.vstack(floor_a),
+        np.vstack(floor_b),
+        np.concatenate(index_a),
+        np.concatenate(index_b),
+        np.concatenate(rank),
+        np.concatenate(turn),
+    )
+
+
+def modes(found, *, scales=0.0, options=OPTIONS, gate=None, seed=0):
+    return find_modes(found, TOLERANCE_M, scales, options, np.random.default_rng(seed), gate)
+
+
+# 40 voters with 2 mm of noise each: 0.3 mm and 1.4 mrad, if no wrong candidate votes by chance; one
+# at the edge of 10 mm takes 0.25 mm and 2 mrad more. Worst seen 2.4 mm at foot b, 0.0032 rad.
+NEAR_M, NEAR_RAD = 0.005, 0.012
+
+
+def assert_near(mode, truth):
+    error = error_of(mode.a_from_b, truth)
+    assert np.hypot(*error[:2]) < NEAR_M
+    assert abs(error[2]) < NEAR_RAD
+
+
+@given(
+    st.builds(Se2, st.floats(-2, 2), st.floats(-2, 2), st.floats(-math.pi, math.pi)),
+    st.integers(0, 2**16),
+    st.booleans(),
+)
+@settings(deadline=None, max_examples=15)
+def test_the_planted_motion_is_found(truth, seed, turned):
+    """One right candidate in four, with and without orientations."""
+    found = planted(np.random.default_rng(seed), (truth,))
+    if not turned:
+        found = found._replace(turn_rad=np.full(len(found.turn_rad), np.nan))
+    best, *rivals = modes(found)
+    assert_near(best, truth)
+    assert best.scale == pytest.approx(1.0, abs=1e-12)
+    assert best.voters[:40].all()
+    # A wrong candidate votes by chance only: a disc of 1 cm on 0.64 m^2 is 0.05 % of the floor.
+    assert best.voters[40:].sum() <= 2
+    assert best.votes >= 40
+    assert all(rival.votes < 0.4 * best.votes for rival in rivals)
+
+
+def test_a_repeated_floor_shows_as_a_rival_of_equal_weight():
+    """Each feature of b lies in a twice, 15 cm apart: no count of inliers tells which is right."""
+    other = Se2(TRUTH.x_m + 0.15, TRUTH.y_m, TRUTH.theta_rad)
+    found = modes(planted(np.random.default_rng(1), (TRUTH, other)))
+    assert len(found) >= 2
+    assert found[1].votes > 0.9 * found[0].votes
+    places = sorted(found[:2], key=lambda mode: mode.a_from_b.x_m)
+    assert_near(places[0], TRUTH)
+    assert_near(places[1], other)
+
+
+def test_motions_that_differ_in_turn_alone_are_rivals():
+    """About the middle of the view: no distance tells them apart there."""
+    turned = Se2(0.0, 0.0, 1.0)
+    found = modes(planted(np.random.default_rng(2), (IDENTITY, turned)))
+    headings = sorted(mode.a_from_b.theta_rad for mode in found[:2])
+    np.testing.assert_allclose(headings, [0.0, 1.0], atol=NEAR_RAD)
+
+
+def test_one_motion_is_not_its_own_rival():
+    """Hypotheses on the slope of the best motion climb back to it."""
+    found = modes(planted(np.random.default_rng(3), wrong=0, noise_m=0.004))
+    assert all(mode.votes < 20 for mode in found[1:])
+
+
+def test_a_gate_leaves_the_rival_out():
+    other = Se2(TRUTH.x_m + 0.15, TRUTH.y_m, TRUTH.theta_rad)
+    found = planted(np.random.default_rng(1), (TRUTH, other))
+    for wanted in (TRUTH, other):
+        expected = wanted @ Se2(0.02, -0.02, 0.03)
+        best, *rivals = modes(found, gate=Gate(expected, 0.06, 0.1))
+        assert_near(best, wanted)
+        assert all(rival.votes < 0.4 * best.votes for rival in rivals)
+
+
+def test_a_gate_elsewhere_leaves_nothing():
+    found = planted(np.random.default_rng(1), wrong=0)
+    assert modes(found, gate=Gate(TRUTH @ Se2(0.3, 0.0, 0.0), 0.06, 0.1)) == []
+    assert modes(found, gate=Gate(TRUTH @ Se2(0.0, 0.0, 0.5), 0.06, 0.1)) == []
+
+
+def test_a_gate_judges_the_place_and_the_turn_apart():
+    """A robot that turned on the spot: its view swings far, which the turn's range allows for."""
+    rng = np.random.default_rng(4)
+    found = planted(rng, (Se2(0.0, 0.0, 0.6),))
+    ahead = np.array([[1.0, 0.0]])
+    far = found._replace(
+        floor_b=found.floor_b + ahead, floor_a=found.floor_a + Se2(0.0, 0.0, 0.6).apply(ahead)
+    )
+    best = modes(far, gate=Gate(Se2(0.0, 0.0, 0.55), 0.02, 0.1))[0]
+    assert best.voters[:40].all()
+    assert best.a_from_b.theta_rad == pytest.approx(0.6, abs=NEAR_RAD)
+    aside = Gate(Se2(0.0, 0.1, 0.6), 0.02, 0.1)  # the turn is right: no swing excuses the place
+    assert all(mode.votes < 5 for mode in modes(far, gate=aside))
+
+
+def test_a_similarity_is_found_where_it_is_looked_for():
+    found = planted(np.random.default_rng(5), scale=1.15)
+    best = modes(found, scales=0.3)[0]
+    assert best.scale == pytest.approx(1.15, rel=0.01)
+    assert best.voters[:40].all()
+    assert_near(best, TRUTH)
+    rigid = modes(found)
+    assert all(mode.votes < 30 and mode.scale == pytest.approx(1.0) for mode in rigid)
+
+
+def test_scales_outside_the_range_are_not_reached():
+    found = planted(np.random.default_rng(5), scale=1.3)
+    for mode in modes(found, scales=0.1):
+        assert abs(math.log(mode.scale)) <= 0.1 + 1e-9
+        assert mode.votes < 30
+
+
+def test_orientations_that_contradict_do_not_vote():
+    found = planted(np.random.default_rng(6), wrong=0)
+    turned = found._replace(turn_rad=found.turn_rad + 2 * OPTIONS.max_turn_rad)
+    assert all(mode.votes < 5 for mode in modes(turned))
+    around = found._replace(turn_rad=found.turn_rad - 2 * math.pi)
+    assert modes(around)[0].votes == 40
+
+
+def test_orientations_a_little_off_do_vote():
+    found = planted(np.random.default_rng(6), wrong=0)
+    off = found._replace(turn_rad=TRUTH.theta_rad + 0.9 * OPTIONS.max_turn_rad * np.ones(40))
+    assert modes(off)[0].votes == 40
+
+
+def test_neighbours_tell_no_motion():
+    """Segments shorter than six tolerances have no direction worth the name."""
+    close = planted(np.random.default_rng(7), wrong=0, size_m=0.02)
+    assert modes(close) == []
+    loose = dataclasses.replace(OPTIONS, min_baseline_tolerances=1.0)
+    assert modes(close, options=loose)
+
+
+def test_too_few_candidates_give_no_motion():
+    found = planted(np.random.default_rng(8), right=1, wrong=0)
+    assert modes(found) == []
+    nothing = Candidates(*(np.asarray(part)[:0] for part in found))
+    assert modes(nothing) == []
+
+
+def test_a_feature_votes_once_however_many_candidates_it_has():
+    """Copies of every candidate of a, a millimetre apart: forty votes, not two hundred."""
+    found = planted(np.random.default_rng(9), wrong=0)
+    copies = Candidates(*(np.repeat(part, 5, axis=0) for part in found))
+    best = modes(copies)[0]
+    assert best.votes == 40
+    assert best.voters.sum() == 40
+
+
+def test_no_more_modes_than_asked_for():
+    motions = [Se2(0.15 * k, 0.0, 0.0) for k in range(5)]
+    found = planted(np.random.default_rng(10), motions, wrong=0)
+    assert len(modes(found)) == OPTIONS.num_modes
+    many = modes(found, options=dataclasses.replace(OPTIONS, num_modes=5))
+    assert [mode.votes for mode in many] == [40] * 5
+    np.testing.assert_allclose(
+        sorted(mode.a_from_b.x_m for mode in many), 0.15 * np.arange(5), atol=NEAR_M
+    )
+
+
+def test_the_same_draws_give_the_same_modes():
+    found = planted(np.random.default_rng(11))
+    one, two = modes(found, seed=3), modes(found, seed=3)
+    assert [m.a_from_b for m in one] == [m.a_from_b for m in two]
+    assert_near(modes(found, seed=4)[0], one[0].a_from_b)
+
+
+def test_moving_a_view_moves_the_motion():
+    found = planted(np.random.default_rng(12))
+    shift = Se2(0.7, 1.1, -2.5)  # new frame of b seen from the old one
+    moved = found._replace(
+        floor_b=shift.inverse().apply(found.floor_b), turn_rad=found.turn_rad + shift.theta_rad
+    )
+    old, new = modes(found)[0], modes(moved)[0]
+    assert_near(new, old.a_from_b @ shift)
+    assert new.votes == old.votes
+
+
+@given(st.integers(0, 2**16))
+@settings(deadline=None, max_examples=30)
+def test_voters_are_one_to_one_and_the_nearest(seed):
+    rng = np.random.default_rng(seed)
+    count = 60
+    floor = rng.uniform(-0.03, 0.03, (2, count, 2))
+    index_a = np.sort(rng.integers(0, 15, count))
+    index_b = rng.integers(0, 15, count)
+    found = Candidates(*floor, index_a, index_b, np.zeros(count, int), np.zeros(count))
+    motion = np.array([1.0, 0.0, 0.002, 0.001])
+    voters = one_to_one(found, motion, 0.02, 0.5)
+    distance = np.hypot(*(floor[1] + motion[2:] - floor[0]).T)
+    near = distance < 0.02
+    assert not voters[~near].any()
+    for index in (index_a, index_b):
+        assert len(set(index[voters])) == voters.sum()
+    first = near & (distance == distance[near].min(initial=np.inf))
+    assert voters[first].all()
+    # A candidate that is the nearest of its a is left out only for a nearer one of its b.
+    for i in np.flatnonzero(near):
+        if distance[i] == distance[near & (index_a == index_a[i])].min():
+            chosen = voters & (index_b == index_b[i])
+            assert chosen.any()
+            assert distance[chosen][0] <= distance[i]
