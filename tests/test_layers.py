@@ -9,8 +9,8 @@ ROOT = Path(__file__).parents[1]
 ROOMS = ("frontend", "backend", "tools")
 BORDER = {"groundfuse.backend.measurement", "groundfuse.backend.reprojection"}
 FOREIGN = {
-    "frontend": {"gtsam", "gtsam_unstable", "open3d", "tqdm", "joblib", "tyro", "yaml"},
-    "backend": {"cv2", "open3d", "tqdm", "joblib", "tyro", "yaml"},
+    "frontend": {"gtsam", "gtsam_unstable", "open3d", "tqdm", "joblib", "yaml"},
+    "backend": {"cv2", "open3d", "tqdm", "joblib", "yaml"},
     "tools": set(),
 }
 """What a room never imports; pictures belong to the one, graphs to the other, the user to tools."""

@@ -1,5 +1,6 @@
 """The wheel holds every module and works without the checkout; the lock agrees with the project."""
 
+import ast
 import re
 import shutil
 import subprocess
@@ -98,6 +99,27 @@ def test_every_module_imports_from_the_wheel_alone(wheel, tmp_path):
         check=False,
     )
     assert done.stdout == "all imported\n", done.stderr[-2000:]
+
+
+MODULE_OF = {"opencv-python-headless": "cv2", "PyYAML": "yaml", "gtsam": "gtsam gtsam_unstable"}
+
+
+def test_every_import_is_declared():
+    """What happens to be installed here need not be where the wheel goes."""
+    wanted = PROJECT["dependencies"] + PROJECT["optional-dependencies"]["view"]
+    names = [Requirement(line).name for line in wanted]
+    declared = {module for name in names for module in MODULE_OF.get(name, name).split()}
+    found = set()
+    for room in ROOMS:
+        for path in (ROOT / room).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, ast.Import):
+                    found |= {alias.name.split(".")[0] for alias in node.names}
+                elif isinstance(node, ast.ImportFrom):
+                    found.add((node.module or "").split(".")[0])
+    assert found - declared - sys.stdlib_module_names - {"groundfuse"} == set()
+    idle = [name for name in names if not found & set(MODULE_OF.get(name, name).split())]
+    assert set(idle) <= {"open3d"}, "a dependency that nothing imports"
 
 
 def locked():

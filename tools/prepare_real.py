@@ -7,12 +7,10 @@
   truth. `planar_mosaic_one`, `planar_floorplan_one`: the same six pictures of a single robot A.
 """
 
+import argparse
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-
-import tyro
 
 from groundfuse.tools.errors import DataError, TeamError
 from groundfuse.tools.real_planar import HALVES, WHOLE, planar
@@ -20,30 +18,18 @@ from groundfuse.tools.real_seneca import seneca
 from groundfuse.tools.real_team import RealRobot, write_team
 
 
-@dataclass(frozen=True, kw_only=True)
-class PrepareReal:
-    """Write real photographs as team folders."""
-
-    source: Path = Path("../shared/real")
-    """Folder that has `seneca/` and `planar_frames/`."""
-    out: Path = Path("out/real")
-    """Folder that gets one team folder each."""
-    priors: bool = False
-    """Write GPS heights and motion into Seneca's frame lists."""
-
-
-def teams(options: PrepareReal) -> dict[str, tuple[RealRobot, ...]]:
+def teams(source: Path, *, priors: bool) -> dict[str, tuple[RealRobot, ...]]:
     """Return the robots of every team by the team's name.
 
     Raises:
         DataError: the source isn't there.
     """
-    flat = options.source / "planar_frames"
-    for folder in (options.source / "seneca", flat):
+    flat = source / "planar_frames"
+    for folder in (source / "seneca", flat):
         if not folder.is_dir():
             raise DataError(f"{folder}: no such folder, needed real photographs (see --help)")
     return {
-        "seneca": seneca(options.source / "seneca", priors=options.priors),
+        "seneca": seneca(source / "seneca", priors=priors),
         "planar_mosaic": planar(flat, "mosaic", HALVES),
         "planar_mosaic_one": planar(flat, "mosaic", WHOLE),
         "planar_floorplan": planar(flat, "floorplan", HALVES),
@@ -53,9 +39,27 @@ def teams(options: PrepareReal) -> dict[str, tuple[RealRobot, ...]]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code."""
-    options = tyro.cli(PrepareReal, args=arguments, description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--source",
+        type=Path,
+        default=Path("../shared/real"),
+        help="folder that has seneca/ and planar_frames/ (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out/real"),
+        help="folder that gets one team folder each (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--priors", action="store_true", help="write GPS heights and motion into Seneca's lists"
+    )
+    options = parser.parse_args(arguments)
     try:
-        for name, robots in teams(options).items():
+        for name, robots in teams(options.source, priors=options.priors).items():
             write_team(options.out / name, robots)
             found = ", ".join(f"{robot.name} with {len(robot.frames)}" for robot in robots)
             print(f"{options.out / name}: {found} pictures")
