@@ -143,17 +143,26 @@ def fit_pair(
         state = state.moved(step)
         if step @ hessian @ step < CONVERGED:
             break
-    covariance = np.linalg.inv(hessian)
     pull = state.attitude - mean
+    converged = bool(step @ hessian @ step < CONVERGED)
+    return _result(
+        state, hessian, inliers, noise, float(pull @ (information * pull)), converged=converged
+    )
+
+
+def _result(
+    state: _State, hessian: Floats, inliers: Mask, noise: float, chi2: float, *, converged: bool
+) -> PairFit:
+    covariance = np.linalg.inv(hessian)[:3, :3]
     return PairFit(
         state.pose,
-        (covariance[:3, :3] + covariance[:3, :3].T) / 2.0,
+        (covariance + covariance.T) / 2.0,
         Attitude(*map(float, state.attitude[:3])),
         Attitude(*map(float, state.attitude[3:])),
         inliers,
         noise,
-        float(pull @ (information * pull)),
-        bool(step @ hessian @ step < CONVERGED),
+        chi2,
+        converged,
     )
 
 

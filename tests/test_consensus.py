@@ -23,7 +23,7 @@ OPTIONS = ConsensusOptions(num_draws=8000)
 TRUTH = Se2(0.3, -0.2, 2.0)
 
 
-def planted(rng, motions=(TRUTH,), right=40, wrong=120, scale=1.0, noise_m=0.002, size_m=0.4):
+def planted(rng, motions=(TRUTH,), right=40, wrong=120, scale=1.0, noise_m=0.0015, size_m=0.4):
     """Features of b, each with one right candidate per motion and some wrong ones, shuffled."""
     in_b = rng.uniform(-size_m, size_m, (right, 2))
     floor_a, floor_b, index_a, index_b, rank, turn = [], [], [], [], [], []
@@ -54,8 +54,8 @@ def modes(found, *, scales=0.0, options=OPTIONS, gate=None, seed=0):
     return find_modes(found, TOLERANCE_M, scales, options, np.random.default_rng(seed), gate)
 
 
-# 40 voters with 2 mm of noise each: 0.3 mm and 1.4 mrad, if no wrong candidate votes by chance; one
-# at the edge of 10 mm takes 0.25 mm and 2 mrad more. Worst seen 2.4 mm at foot b, 0.0032 rad.
+# 40 voters with 1.5 mm of noise each: 0.3 mm and 1 mrad, if no wrong candidate votes by chance; one
+# at the edge of 10 mm takes 0.25 mm and 2 mrad more. Worst seen, with 2 mm of noise: 2.4 mm at foot b, 0.0032 rad.
 NEAR_M, NEAR_RAD = 0.005, 0.012
 
 
