@@ -8,7 +8,8 @@ tracks, and the second stage solves for all of them. numpy and scipy only.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from enum import Enum, auto
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +23,17 @@ from groundfuse.backend.bundle_estimate import (
     BundleRefusal,
     Illposed,
 )
-from groundfuse.backend.bundle_lens import refine_lenses
+from groundfuse.backend.bundle_files import (
+    FileTest,
+    as_filed,
+    contradicted,
+    files_test,
+    freed_priors,
+    with_better_files,
+)
 from groundfuse.backend.bundle_model import State
 from groundfuse.backend.bundle_priors import Priors
+from groundfuse.backend.bundle_relief import settle_relief
 from groundfuse.backend.bundle_report import Ends, report
 from groundfuse.backend.bundle_setup import (
     Team,
@@ -37,8 +46,11 @@ from groundfuse.backend.bundle_setup import (
 )
 from groundfuse.backend.bundle_solve import Problem, Solution, minimise, problem_of
 from groundfuse.backend.bundle_tracks import (
+    Integers,
+    Links,
     Sightings,
     observations,
+    sampled,
     sightings_from_edges,
     single_links,
     thinned,
@@ -53,14 +65,35 @@ START_SETTLED, SETTLED = 10.0, 0.1
 DEFAULT = BundleOptions()
 
 
+class Sample(Enum):
+    """Which sightings a stage uses."""
+
+    LINKS = auto()
+    """A few correspondences, each a floor point of its own."""
+    TRACKS = auto()
+    """Some floor points with all their sightings."""
+    ALL = auto()
+    """Everything."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Job:
-    """What both stages share."""
+    """What all stages share.
+
+    Attributes:
+        team: frames and robots by number.
+        cameras: by robot.
+        sightings: keypoints.
+        links: correspondences, right and wrong.
+        edges: pairs, by the links' numbers.
+        options: see there.
+    """
 
     team: Team
-    priors: Priors
     cameras: Mapping[str, BundleCamera]
     sightings: Sightings
+    links: Links
+    edges: Sequence[RelativePose]
     options: BundleOptions
 
 
@@ -94,44 +127,62 @@ def bundle(
     ]
     priors = priors_of(team, prior, sigma, options)
     sightings, links = sightings_from_edges(used, team.index_of)
-    job = Job(team, priors, cameras, sightings, options)
     state = start_state(team, start, priors, cameras)
+    job = Job(team, cameras, sightings, links, used, options)
     try:
-        clean = cut(links, used, np.zeros(len(links), dtype=np.bool_), options)
-        first = _stage(job, clean, state, thin=True)
-        if isinstance(first, BundleRefusal):
-            return first
-        chi2 = link_chi2(links, sightings, first[1].state, priors.robot_of, first[1].noise)
-        clean = cut(links, used, chi2 > options.link_gate_sigma**2, options)
-        second = _stage(job, clean, first[1].state, thin=False)
+        found = _solved(job, priors, state)
     except NotPositiveDefiniteError:
         text = "the correspondences leave a pose or an attitude undetermined"
         return BundleRefusal(Illposed.SINGULAR, float(len(links)), float(len(links)), text)
-    if isinstance(second, BundleRefusal):
-        return second
-    problem, solution, lens = refine_lenses(*second, options, SETTLED)
-    ends = Ends(start, team, cameras, options)
-    return report(ends, problem, solution, clean, lens)
+    if isinstance(found, BundleRefusal):
+        return found
+    return report(Ends(start, team, cameras, options), *found)
+
+
+def _solved(
+    job: Job, priors: Priors, state: State
+) -> tuple[Problem, Solution, Cut, FileTest] | BundleRefusal:
+    """Cut wrong correspondences, see whether the floor is flat and the files hold, and solve."""
+    options = job.options
+    clean = cut(job.links, job.edges, np.zeros(len(job.links), dtype=np.bool_), options)
+    first = _stage(job, clean, priors, state, Sample.LINKS)
+    if isinstance(first, BundleRefusal):
+        return first
+    _, rough = first
+    free = contradicted(files_test(*first, options), priors, options)
+    priors, state = freed_priors(priors, free), as_filed(rough.state, free)
+    clean = _cleaned(job, priors, rough, rough.state)
+    trial = _stage(job, clean, priors, state, Sample.TRACKS)
+    if isinstance(trial, BundleRefusal):
+        return trial
+    relief, state = settle_relief(*trial, options, START_SETTLED)
+    if relief > 0.0:
+        priors = replace(priors, relief=relief)
+        clean = _cleaned(job, priors, trial[1], state)
+    last = _stage(job, clean, priors, state, Sample.ALL)
+    if isinstance(last, BundleRefusal):
+        return last
+    problem, solution, test = with_better_files(*last, options, SETTLED)
+    return problem, solution, clean, test
+
+
+def _cleaned(job: Job, priors: Priors, rough: Solution, state: State) -> Cut:
+    """Cut the correspondences that do not meet on the floor."""
+    chi2 = link_chi2(job.links, job.sightings, state, priors, rough.noise)
+    return cut(job.links, job.edges, chi2 > job.options.link_gate_sigma**2, job.options)
 
 
 def _stage(
-    job: Job, clean: Cut, state: State, *, thin: bool
+    job: Job, clean: Cut, priors: Priors, state: State, sample: Sample
 ) -> tuple[Problem, Solution] | BundleRefusal:
-    """Solve with thinned single links, or with all links joined into tracks."""
-    options, priors = job.options, job.priors
+    """Solve with some of the sightings or all."""
+    options = job.options
     if len(clean.links) < options.min_links:
         text = f"{len(clean.links)} correspondences in all, {options.min_links} needed for a pair"
         return BundleRefusal(
             Illposed.NO_POINTS, float(len(clean.links)), float(options.min_links), text
         )
-    if thin:
-        used, point = single_links(
-            clean.links.only(thinned(clean.links, job.sightings, options.start_sightings))
-        )
-    elif options.tracks:
-        used, point = tracks(clean.links, job.sightings)
-    else:
-        used, point = single_links(clean.links)
+    used, point = _sample(job, clean, sample)
     seen = observations(job.sightings, used, point, priors.num_frames)
     between = between_of(clean.weak, job.team, job.cameras)
     loose = loose_frame(seen.pair_key, between, job.team)
@@ -144,6 +195,17 @@ def _stage(
         with_points(state, seen, priors.robot_of),
         width=options.robust_sigma,
         iterations=options.iterations,
-        settled=START_SETTLED if thin else SETTLED,
+        settled=SETTLED if sample is Sample.ALL else START_SETTLED,
     )
     return problem, solution
+
+
+def _sample(job: Job, clean: Cut, sample: Sample) -> tuple[Integers, Integers]:
+    """Sightings and floor points, (sighting, point) of every observation."""
+    if sample is Sample.LINKS:
+        thin = thinned(clean.links, job.sightings, job.options.start_sightings)
+        return single_links(clean.links.only(thin))
+    joined = tracks(clean.links, job.sightings) if job.options.tracks else single_links(clean.links)
+    if sample is Sample.ALL:
+        return joined
+    return sampled(*joined, job.sightings, job.options.trial_sightings)

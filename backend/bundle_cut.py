@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from groundfuse.backend.bundle_estimate import BundleOptions
 from groundfuse.backend.bundle_model import State, floor_points
-from groundfuse.backend.bundle_tracks import Integers, Links, Sightings
+from groundfuse.backend.bundle_priors import Priors
+from groundfuse.backend.bundle_tracks import Links, Sightings
 from groundfuse.backend.measurement import Reason, Rejected, RelativePose
 
 Array = NDArray[np.float64]
@@ -32,13 +33,21 @@ class Cut:
 
 
 def link_chi2(
-    links: Links, sightings: Sightings, state: State, robot_of: Integers, noise: float
+    links: Links, sightings: Sightings, state: State, priors: Priors, noise: float
 ) -> Array:
-    """Squared distance of both ends on the floor over its variance (n,); inf above a horizon."""
-    points, by_ray = floor_points(sightings.frame, sightings.ray, state, robot_of)
-    spread = by_ray @ by_ray.transpose(0, 2, 1) * ((noise * sightings.sigma) ** 2)[:, None, None]
-    apart = points[links.a] - points[links.b]
+    """Squared distance of both ends on the floor over its variance (n,); inf above a horizon.
+
+    A point above the floor lands elsewhere for each camera: relief counts as variance.
+    """
+    landing = floor_points(sightings.frame, sightings.ray, state, priors.robot_of)
+    spread = landing.by_ray @ landing.by_ray.transpose(0, 2, 1)
+    spread *= ((noise * sightings.sigma) ** 2)[:, None, None]
+    apart = landing.point[links.a] - landing.point[links.b]
     total = spread[links.a] + spread[links.b]
+    if priors.relief > 0.0:
+        height = state.attitude[sightings.frame[links.a], 2][:, None]
+        parallax = priors.relief * height * (landing.slope[links.a] - landing.slope[links.b])
+        total += parallax[:, :, None] * parallax[:, None, :]
     xx, xy, yy = total[:, 0, 0], total[:, 0, 1], total[:, 1, 1]
     chi2 = yy * apart[:, 0] ** 2 - 2.0 * xy * apart[:, 0] * apart[:, 1] + xx * apart[:, 1] ** 2
     found = chi2 / (xx * yy - xy * xy)

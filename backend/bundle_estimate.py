@@ -33,10 +33,17 @@ class BundleOptions:
     """Whether to estimate each robot's first radial distortion term."""
     distortion_sigma: float = 0.02
     """How far that term may lie from its file, one sigma."""
-    lens_gate_sigma: float = 3.0
-    """`if-seen` estimates the lenses where the pictures contradict a file by so many sigmas."""
+    file_gate_sigma: float = 3.0
+    """Mounts and lenses are as filed unless the pictures contradict a file by so many sigmas."""
+    relief: Refine = Refine.IF_SEEN
+    """Whether floor points may lie above or below the plane."""
+    relief_levels: tuple[float, ...] = (0.02, 0.2)
+    """How far, one sigma, fraction of the camera height: the first that explains the residuals.
+    They are wide because a real floor waves, so that the points of a view share most of it."""
     tracks: bool = True
     """Join correspondences that share a keypoint into one floor point; else each is its own."""
+    trial_sightings: int = 200
+    """Sightings per frame in the trial that tells a flat floor from one with relief."""
     start_sightings: int = 250
     """Correspondences per frame in the first stage, which is robust against single wrong ones."""
     robust_sigma: float = 3.0
@@ -60,6 +67,8 @@ class BundleOptions:
             "mount_height_sigma",
             "focal_sigma",
             "distortion_sigma",
+            "file_gate_sigma",
+            "trial_sightings",
             "start_sightings",
             "robust_sigma",
             "link_gate_sigma",
@@ -69,6 +78,9 @@ class BundleOptions:
             value = getattr(self, name)
             if not (value > 0 and math.isfinite(value)):
                 raise ValueError(f"{name} must be positive, got {value:g}")
+        if not self.relief_levels or not all(0.0 < level < 1.0 for level in self.relief_levels):
+            found = ", ".join(f"{level:g}" for level in self.relief_levels) or "none"
+            raise ValueError(f"relief_levels must lie between 0 and 1, got {found}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,11 +104,13 @@ class Estimated:
         value: correction to add to the file's number; None where it is not observable.
         sigma: standard deviation of the value; where there is none, of what is left of the prior.
         prior_sigma: standard deviation before the pictures.
+        used: whether poses rest on the value; else on the file's, which it does not contradict.
     """
 
     value: float | None
     sigma: float
     prior_sigma: float
+    used: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,8 +122,7 @@ class MountEstimate:
         tilt_rad: correction of the tilt.
         roll_rad: correction of the roll.
         height: correction of the height as a fraction, relative to the team's mean scale.
-        focal: correction of the focal length as a fraction; 0 where the file's agrees with the
-            pictures and is kept; None where not asked for.
+        focal: correction of the focal length as a fraction; None where not asked for.
         distortion: correction of the first radial term, likewise.
     """
 
@@ -128,6 +141,7 @@ class FindingKind(StrEnum):
     UNOBSERVABLE = "unobservable"
     APART = "apart"
     CALIBRATION = "calibration"
+    RELIEF = "relief"
     WOBBLE = "wobble"
     NOISE = "noise"
 
@@ -187,6 +201,8 @@ class BundleEstimate:
         num_links_cut: correspondences found wrong.
         rejected: accepted pairs that the bundle turned down.
         findings: what is observable and what is not.
+        relief: standard deviation of the floor points' heights that was allowed for, fraction of
+            the camera height; 0 where the floor is flat.
     """
 
     team: TeamEstimate
@@ -202,3 +218,4 @@ class BundleEstimate:
     num_links_cut: int
     rejected: tuple[Rejected, ...]
     findings: tuple[Finding, ...]
+    relief: float = 0.0

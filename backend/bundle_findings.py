@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from groundfuse.backend.bundle_estimate import Estimated, Finding, FindingKind, MountEstimate
+from groundfuse.backend.bundle_files import FileTest
 from groundfuse.backend.bundle_priors import prior_residual
 from groundfuse.backend.bundle_setup import Team
 from groundfuse.backend.bundle_solve import Problem, Solution
@@ -30,9 +31,9 @@ def findings_of(
     problem: Problem,
     solution: Solution,
     mounts: tuple[MountEstimate, ...],
-    shared: Array,
+    test: FileTest,
 ) -> tuple[Finding, ...]:
-    """List all statements; `shared` is the covariance of the robots' unknowns."""
+    """List all statements but the one about scale."""
     return (
         *_apart(team, problem),
         *(
@@ -40,7 +41,8 @@ def findings_of(
             for index, mount in enumerate(mounts)
             for finding in _mount(mount, _cause(problem, solution, index))
         ),
-        *_relative_heights(team, problem, solution, shared),
+        *_relative_heights(team, problem, test),
+        *_relief(team, problem, solution),
         *_wobble(team, problem, solution),
         *_noise(team, solution),
     )
@@ -107,17 +109,15 @@ def _mount(mount: MountEstimate, cause: str) -> Iterator[Finding]:
             yield Finding(FindingKind.CALIBRATION, (mount.robot,), found.value, text)
 
 
-def _relative_heights(
-    team: Team, problem: Problem, solution: Solution, shared: Array
-) -> Iterator[Finding]:
+def _relative_heights(team: Team, problem: Problem, test: FileTest) -> Iterator[Finding]:
     """Heights of robots against the first of their group."""
-    groups = problem.priors.group_of
+    groups, shared = problem.priors.group_of, test.covariance
     for group in range(int(groups.max()) + 1):
         members = np.flatnonzero(groups == group).tolist()
         first = 6 * members[0] + 2
         for index in members[1:]:
             place = 6 * index + 2
-            value = float(solution.state.shared[index, 2] - solution.state.shared[members[0], 2])
+            value = float(test.value[index, 2] - test.value[members[0], 2])
             variance = shared[first, first] + shared[place, place] - 2.0 * shared[first, place]
             sigma = math.sqrt(max(variance, 0.0))
             if abs(value) > FAR_OFF_SIGMA * sigma:
@@ -127,6 +127,14 @@ def _relative_heights(
                     f"{100 * value:+.3g} +- {100 * sigma:.2g} %"
                 )
                 yield Finding(FindingKind.CALIBRATION, pair, value, text)
+
+
+def _relief(team: Team, problem: Problem, solution: Solution) -> Iterator[Finding]:
+    """A floor that is not flat."""
+    if problem.priors.relief > 0.0:
+        spread_m = float(np.std(solution.state.point[:, 2]))
+        text = f"the floor is not flat: its points' heights spread by {spread_m:.2g} m"
+        yield Finding(FindingKind.RELIEF, team.robots, spread_m, text)
 
 
 def _wobble(team: Team, problem: Problem, solution: Solution) -> Iterator[Finding]:

@@ -30,7 +30,7 @@ class State:
         attitude: (frames, 3) tilt rad, roll rad, height m.
         shared: (robots, 6) per robot: mount offsets of tilt rad, roll rad, height (fraction); focal
             length (fraction), first distortion term; a spare that stays 0.
-        point: (points, 2) floor points in their component's frame, m.
+        point: (points, 3) floor points in their component's frame, m; z is 0 on a flat floor.
     """
 
     pose: Array
@@ -52,7 +52,7 @@ class View:
         turn: cosine and sine of the heading.
         tilt: cosine and sine.
         roll: cosine and sine.
-        height: of the camera.
+        height: of the camera over the point.
     """
 
     x: Array
@@ -72,7 +72,7 @@ class Derivatives:
 
     Attributes:
         by_frame: (6, n, 2) by a right perturbation of the pose, and by tilt, roll, height.
-        by_point: (2, n, 2) by the floor point.
+        by_point: (3, n, 2) by the floor point.
         by_lens: (2, n, 2) by focal length and distortion.
     """
 
@@ -89,7 +89,8 @@ def view_of(seen: Observations, state: State, part: slice) -> View:
         return np.cos(angle)[frame], np.sin(angle)[frame]
 
     (turn_c, turn_s), tilt = turned(state.pose[:, 2]), turned(state.attitude[:, 0])
-    roll, h = turned(state.attitude[:, 1]), state.attitude[:, 2][frame]
+    roll = turned(state.attitude[:, 1])
+    h = state.attitude[:, 2][frame] - state.point[:, 2][point]
     dx = state.point[:, 0][point] - state.pose[:, 0][frame]
     dy = state.point[:, 1][point] - state.pose[:, 1][frame]
     qx, qy = turn_c * dx + turn_s * dy, turn_c * dy - turn_s * dx
@@ -120,7 +121,7 @@ def derivatives(view: View) -> Derivatives:
     """Differentiate the projection, lens corrections apart."""
     x, y, per = view.x, view.y, view.per_depth
     (turn_c, turn_s), (ca, sa), (cr, sr) = view.turn, view.tilt, view.roll
-    by_frame, by_point = np.empty((6, len(per), 2)), np.empty((2, len(per), 2))
+    by_frame, by_point = np.empty((6, len(per), 2)), np.empty((3, len(per), 2))
     by_qx, by_qy = np.empty((len(per), 2)), np.empty((len(per), 2))
     by_qx[:, 0], by_qx[:, 1] = -x * sa * per, -(ca + y * sa) * per
     by_qy[:, 0], by_qy[:, 1] = -(cr + x * sr * ca) * per, sr * (sa - y * ca) * per
@@ -132,7 +133,8 @@ def derivatives(view: View) -> Derivatives:
     by_frame[5, :, 0], by_frame[5, :, 1] = (sr - x * cr * ca) * per, cr * (sa - y * ca) * per
     by_point[0] = by_qx * turn_c[:, None] - by_qy * turn_s[:, None]
     by_point[1] = by_qx * turn_s[:, None] + by_qy * turn_c[:, None]
-    return Derivatives(by_frame, by_point, np.zeros_like(by_point))
+    by_point[2] = -by_frame[5]
+    return Derivatives(by_frame, by_point, np.zeros_like(by_point[:2]))
 
 
 def through_lens(ideal: Derivatives, view: View, shared: Array) -> Derivatives:
@@ -152,10 +154,23 @@ def through_lens(ideal: Derivatives, view: View, shared: Array) -> Derivatives:
     return Derivatives(carried(ideal.by_frame), carried(ideal.by_point), by_lens)
 
 
-def floor_points(
-    frame: Integers, ray: Array, state: State, robot_of: Integers
-) -> tuple[Array, Array]:
-    """Where rays meet the floor: (n, 2) in the component's frame and (n, 2, 2) by the ray."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Landing:
+    """Where rays meet the flat floor, in the component's frame.
+
+    Attributes:
+        point: (n, 2) m; nan above the horizon.
+        by_ray: (n, 2, 2) its derivative by the ray.
+        slope: (n, 2) horizontal way of the ray per height.
+    """
+
+    point: Array
+    by_ray: Array
+    slope: Array
+
+
+def floor_points(frame: Integers, ray: Array, state: State, robot_of: Integers) -> Landing:
+    """Intersect rays with the flat floor."""
     shared = state.shared[robot_of[frame]]
     radius2 = np.sum(ray * ray, axis=1, keepdims=True)
     ray = ray / ((1.0 + shared[:, 3:4]) * (1.0 + shared[:, 4:5] * radius2))
@@ -171,21 +186,18 @@ def floor_points(
     by_y = np.stack([-ca - qx * cr * sa, sr * sa - qy * cr * sa], axis=1) * (h * per)[:, None]
     turn_c, turn_s = np.cos(state.pose[:, 2])[frame], np.sin(state.pose[:, 2])[frame]
     turn = np.stack([np.stack([turn_c, -turn_s], 1), np.stack([turn_s, turn_c], 1)], axis=1)
-    at_foot = np.stack([qx * h, qy * h], axis=1)
-    points = (turn @ at_foot[:, :, None])[:, :, 0] + state.pose[frame, :2]
-    return points, turn @ np.stack([by_x, by_y], axis=2)
+    slope = (turn @ np.stack([qx, qy], axis=1)[:, :, None])[:, :, 0]
+    points = slope * h[:, None] + state.pose[frame, :2]
+    return Landing(points, turn @ np.stack([by_x, by_y], axis=2), slope)
 
 
 def moved(state: State, step: Array, point_step: Array) -> State:
-    """Apply a step (frames + robots, 6) and a step of the points (n, 2)."""
+    """Apply a step (frames + robots, 6) and a step of the points (n, 2 or 3)."""
     count = len(state.pose)
     c, s = np.cos(state.pose[:, 2]), np.sin(state.pose[:, 2])
     pose = state.pose + step[:count, :3]
     pose[:, 0] = state.pose[:, 0] + c * step[:count, 0] - s * step[:count, 1]
     pose[:, 1] = state.pose[:, 1] + s * step[:count, 0] + c * step[:count, 1]
-    return State(
-        pose,
-        state.attitude + step[:count, 3:],
-        state.shared + step[count:],
-        state.point + point_step,
-    )
+    point = state.point.copy()
+    point[:, : point_step.shape[1]] += point_step
+    return State(pose, state.attitude + step[:count, 3:], state.shared + step[count:], point)

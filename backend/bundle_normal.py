@@ -25,13 +25,17 @@ class Rows:
 
     Attributes:
         by_frame: (6, n, 2).
-        by_point: (2, n, 2).
+        by_point: (d, n, 2): by x and y, and z where the floor has relief.
         by_lens: (2, n, 2); (2, 0, 2) where lenses are as filed.
+        relief: (3, points) of the relief's prior at each point: its residual -z / (relief h), and
+            the derivatives of z / (relief h) by z and by the height h of the first camera that
+            sees the point; (3, 0) on a flat floor.
     """
 
     by_frame: Array
     by_point: Array
     by_lens: Array
+    relief: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,10 +44,10 @@ class Reduced:
 
     Attributes:
         rows: whitened derivatives.
-        basis: (2, n, 2) Q' of every sighting: orthonormal over the sightings of a point.
-        by_frame: (6, n, 2) Q'J of every sighting, by row of Q'.
-        by_lens: (points, 2, robots, 2) Q'K of every floor point; None where lenses are as filed.
-        root: (3, points) Cholesky factor l00, l10, l11 of every point's information.
+        basis: (d, n, 2) Q' of every sighting: orthonormal over the sightings of a point.
+        by_frame: (6, n, d) Q'J of every sighting, by row of Q'.
+        by_lens: (points, d, robots, 2) Q'K of every floor point; None where lenses are as filed.
+        root: (d, d, points) lower Cholesky factor of every point's information.
         blocks: (n, 6, 6) of the reduced system by the pattern.
     """
 
@@ -58,7 +62,8 @@ class Reduced:
 def whitened_rows(seen: Observations, state: State, weight: Array, priors: Priors) -> Rows:
     """Differentiate all sightings; `weight` (n,) is the kernel's over the variance."""
     count, lens = len(seen.frame), bool(priors.free_lens.any())
-    by_frame, by_point = np.empty((BLOCK, count, 2)), np.empty((2, count, 2))
+    size = 3 if priors.relief > 0.0 else 2
+    by_frame, by_point = np.empty((BLOCK, count, 2)), np.empty((size, count, 2))
     by_lens, root_weight = np.empty((2, count if lens else 0, 2)), np.sqrt(weight)[:, None]
     for part in seen.parts:
         view = view_of(seen, state, part)
@@ -70,10 +75,20 @@ def whitened_rows(seen: Observations, state: State, weight: Array, priors: Prior
             free = priors.free_lens[robot].T[:, :, None]
             by_lens[:, part] = found.by_lens * root_weight[part] * free
         by_frame[:, part] = found.by_frame * root_weight[part]
-        by_point[:, part] = found.by_point * root_weight[part]
+        by_point[:, part] = found.by_point[:size] * root_weight[part]
     for index in np.flatnonzero(priors.fixed).tolist():
         by_frame[:3, seen.frame_start[index] : seen.frame_start[index + 1]] = 0.0
-    return Rows(by_frame, by_point, by_lens)
+    return Rows(by_frame, by_point, by_lens, relief_rows(seen, state, priors))
+
+
+def relief_rows(seen: Observations, state: State, priors: Priors) -> Array:
+    """Prior of the floor points' heights, see `Rows`."""
+    if priors.relief == 0.0:
+        return np.zeros((3, 0))
+    height = state.attitude[seen.frame[seen.first], 2]
+    by_z = 1.0 / (priors.relief * height)
+    value = state.point[:, 2] * by_z
+    return np.stack([-value, by_z, -value / height])
 
 
 def _by_points(values: Array, point: Integers, num_points: int) -> Array:
@@ -83,50 +98,63 @@ def _by_points(values: Array, point: Integers, num_points: int) -> Array:
 
 
 def _projected(basis: Array, derivative: Array) -> Array:
-    """Q'D of some sightings: (k, n, 2) from derivatives (k, n, 2)."""
-    result = np.empty_like(derivative)
-    for row in range(2):
+    """Q'D of some sightings: (k, n, d) from derivatives (k, n, 2)."""
+    result = np.empty((*derivative.shape[:2], len(basis)))
+    for row in range(len(basis)):
         x, y = basis[row, :, 0], basis[row, :, 1]
         result[:, :, row] = x * derivative[:, :, 0] + y * derivative[:, :, 1]
     return result
 
 
-def _root(by_point: Array, point: Integers, num_points: int) -> Array:
-    """Cholesky factor (3, points) of each point's information."""
-    tiny = np.finfo(np.float64).tiny
+def _root(by_point: Array, seen: Observations, relief: Array) -> Array:
+    """Lower Cholesky factor (d, d, points) of each point's information.
 
-    def total(i: int, j: int) -> Array:
-        product = by_point[i, :, 0] * by_point[j, :, 0] + by_point[i, :, 1] * by_point[j, :, 1]
-        return _by_points(product[:, None], point, num_points)[:, 0]
-
-    l00 = np.sqrt(np.maximum(total(0, 0), tiny))
-    l10 = total(0, 1) / l00
-    l11 = np.sqrt(np.maximum(total(1, 1) - l10 * l10, 1e-12 * l00 * l00 + tiny))
-    return np.stack([l00, l10, l11])
+    A direction that no sighting tells gets a tiny pivot instead of zero: no step goes there,
+    because no derivative does.
+    """
+    size, tiny = len(by_point), np.finfo(np.float64).tiny
+    root = np.zeros((size, size, seen.num_points))
+    for i in range(size):
+        for j in range(i + 1):
+            product = by_point[i, :, 0] * by_point[j, :, 0] + by_point[i, :, 1] * by_point[j, :, 1]
+            total = _by_points(product[:, None], seen.point, seen.num_points)[:, 0]
+            total += relief[1] ** 2 if i == j == 2 else 0.0
+            rest = total - np.sum(root[i, :j] * root[j, :j], axis=0)
+            root[i, j] = (
+                np.sqrt(np.maximum(rest, 1e-12 * total + tiny)) if i == j else rest / root[j, j]
+            )
+    return root
 
 
 def _basis(by_point: Array, root: Array) -> Array:
-    """Rows Q' (2, n, 2) of some sightings from the factors (3, n) of their points."""
+    """Rows Q' (d, n, 2) of some sightings from the factors (d, d, n) of their points."""
     basis = np.empty_like(by_point)
-    basis[0] = by_point[0] / root[0][:, None]
-    basis[1] = (by_point[1] - root[1][:, None] * basis[0]) / root[2][:, None]
+    for row in range(len(by_point)):
+        rest = by_point[row].copy()
+        for before in range(row):
+            rest -= root[row, before][:, None] * basis[before]
+        basis[row] = rest / root[row, row][:, None]
     return basis
 
 
 def reduce_rows(seen: Observations, rows: Rows, pattern: Pattern, priors: Priors) -> Reduced:
     """Accumulate the sightings and eliminate their floor points."""
-    root = _root(rows.by_point, seen.point, seen.num_points)
-    basis, by_frame = np.empty_like(rows.by_point), np.empty_like(rows.by_frame)
-    lens_rows = np.empty_like(rows.by_lens)
+    root = _root(rows.by_point, seen, rows.relief)
+    basis, size = np.empty_like(rows.by_point), len(rows.by_point)
+    by_frame = np.empty((*rows.by_frame.shape[:2], size))
+    lens_rows = np.empty((*rows.by_lens.shape[:2], size))
     for part in seen.parts:
-        basis[:, part] = _basis(rows.by_point[:, part], root[:, seen.point[part]])
+        basis[:, part] = _basis(rows.by_point[:, part], root[:, :, seen.point[part]])
         by_frame[:, part] = _projected(basis[:, part], rows.by_frame[:, part])
         if lens_rows.size:
             lens_rows[:, part] = _projected(basis[:, part], rows.by_lens[:, part])
     blocks = np.zeros((len(pattern.rows), BLOCK, BLOCK))
+    if size == 3:
+        by_frame[5, seen.first, 2] += rows.relief[1] * rows.relief[2] / root[2, 2]
+        np.add.at(blocks[:, 5, 5], seen.frame[seen.first], rows.relief[2] ** 2)
     for frame, part in enumerate(frame_parts(seen)):
         own, out = rows.by_frame[:, part].reshape(BLOCK, -1), by_frame[:, part].reshape(BLOCK, -1)
-        blocks[frame] = own @ own.T - out @ out.T
+        blocks[frame] += own @ own.T - out @ out.T
     _add_pairs(seen, by_frame, pattern, blocks)
     by_lens = _lens_by_points(seen, lens_rows, priors) if lens_rows.size else None
     reduced = Reduced(rows, basis, by_frame, by_lens, root, blocks)
@@ -142,21 +170,25 @@ def frame_parts(seen: Observations) -> list[slice]:
 
 
 def right_side(
-    seen: Observations, reduced: Reduced, error: Array, priors: Priors
+    seen: Observations, reduced: Reduced, error: Array, relief: Array, priors: Priors
 ) -> tuple[Array, Array]:
-    """Right-hand side (frames + robots, 6), and Q'e of every floor point (points, 2).
+    """Right-hand side (frames + robots, 6), and Q'e of every floor point (points, d).
 
     `error` (n, 2) is whitened; where weights have changed since the rows were, by the old root.
+    `relief` are the rows of the relief's prior at the same state.
     """
-    explained = np.empty_like(error)
+    explained = np.empty((len(error), len(reduced.basis)))
     for part in seen.parts:
         explained[part] = _projected(reduced.basis[:, part], error[None, part])[0]
     by_points = _by_points(explained, seen.point, seen.num_points)
     right = np.zeros((priors.num_nodes, BLOCK))
+    if len(reduced.basis) == 3:
+        by_points[:, 2] += relief[1] * relief[0] / reduced.root[2, 2]
+        np.add.at(right[:, 5], seen.frame[seen.first], relief[2] * relief[0])
     lens = right[priors.num_frames :, 3:5]
     for frame, part in enumerate(frame_parts(seen)):
         own, out = reduced.rows.by_frame[:, part], reduced.by_frame[:, part]
-        right[frame] = own.reshape(BLOCK, -1) @ error[part].ravel()
+        right[frame] += own.reshape(BLOCK, -1) @ error[part].ravel()
         right[frame] -= out.reshape(BLOCK, -1) @ by_points[seen.point[part]].ravel()
         if reduced.by_lens is not None:
             k = reduced.rows.by_lens[:, part].reshape(2, -1)
@@ -182,11 +214,11 @@ def _add_pairs(seen: Observations, by_frame: Array, pattern: Pattern, blocks: Ar
 
 
 def _lens_by_points(seen: Observations, lens_rows: Array, priors: Priors) -> Array:
-    """Q'K of every floor point, (points, 2, robots, 2): by row, robot, unknown."""
+    """Q'K of every floor point, (points, d, robots, 2): by row, robot, unknown."""
     place = seen.point * priors.num_robots + priors.robot_of[seen.frame]
-    flat = lens_rows.transpose(1, 2, 0).reshape(-1, 4)
+    flat = lens_rows.transpose(1, 2, 0).reshape(lens_rows.shape[1], -1)
     sums = _by_points(flat, place, seen.num_points * priors.num_robots)
-    split = sums.reshape(seen.num_points, priors.num_robots, 2, 2)
+    split = sums.reshape(seen.num_points, priors.num_robots, -1, 2)
     return np.ascontiguousarray(split.transpose(0, 2, 1, 3))
 
 
@@ -219,14 +251,16 @@ def _add_lens(
 def point_steps(
     seen: Observations, reduced: Reduced, explained: Array, step: Array, priors: Priors
 ) -> Array:
-    """Steps (points, 2) of the floor points that go with a step (frames + robots, 6)."""
-    change = np.empty((len(seen.frame), 2))
+    """Steps (points, d) of the floor points that go with a step (frames + robots, 6)."""
+    change = np.empty((len(seen.frame), len(reduced.basis)))
     for frame, part in enumerate(frame_parts(seen)):
         change[part] = np.tensordot(step[frame], reduced.by_frame[:, part], axes=1)
     rest = explained - _by_points(change, seen.point, seen.num_points)
     if reduced.by_lens is not None:
-        flat = reduced.by_lens.reshape(seen.num_points, 2, -1)
+        flat = reduced.by_lens.reshape(*rest.shape, -1)
         rest = rest - flat @ step[priors.num_frames :, 3:5].ravel()
-    l00, l10, l11 = reduced.root
-    y = rest[:, 1] / l11
-    return np.stack([(rest[:, 0] - l10 * y) / l00, y], axis=1)
+    for row in reversed(range(rest.shape[1])):
+        for after in range(row + 1, rest.shape[1]):
+            rest[:, row] -= reduced.root[after, row] * rest[:, after]
+        rest[:, row] /= reduced.root[row, row]
+    return rest

@@ -28,7 +28,10 @@ class Priors:
         robot_of: (frames,) robot of each frame.
         fixed: (frames,) whether a frame is the reference of its component.
         group_of: (robots,) robots of the same number share a scale.
+        free_mount: (robots, 3) whether offsets of tilt, roll, height are unknowns.
         free_lens: (robots, 2) whether focal length and distortion are unknowns.
+        relief: standard deviation of the floor points' heights as a fraction of the height of the
+            first camera that sees them (so that no scale is better than another); 0 if flat.
     """
 
     attitude: Array
@@ -37,7 +40,9 @@ class Priors:
     robot_of: Integers
     fixed: Mask
     group_of: Integers
+    free_mount: Mask
     free_lens: Mask
+    relief: float
 
     @property
     def num_frames(self) -> int:
@@ -126,7 +131,7 @@ def _by_offset(priors: Priors) -> Array:
     """Derivative (frames, 3) of the whitened residual by the robot's offsets."""
     scale = np.ones((priors.num_frames, 3))
     scale[:, 2] = priors.attitude[:, 2]  # a height's offset is a fraction
-    by_offset: Array = scale / priors.sigma
+    by_offset: Array = scale / priors.sigma * priors.free_mount[priors.robot_of]
     return by_offset
 
 
@@ -148,7 +153,7 @@ def _between_errors(state: State, between: Between) -> tuple[Array, Array]:
 
 
 def prior_cost(state: State, priors: Priors, between: Between) -> float:
-    """Sum of squares of everything but the sightings."""
+    """Sum of squares of everything but the sightings and the relief."""
     wobble, odometry = prior_residual(state, priors), between_residual(state, between)
     common = np.bincount(priors.group_of, state.shared[:, 2]) / SCALE_GAUGE_SIGMA
     parts = (wobble, odometry, common, state.shared / priors.shared_sigma)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from groundfuse.backend.bundle_cholesky import inverse_between, inverse_diagonal, solve
+from groundfuse.backend.bundle_cholesky import inverse_diagonal, solve
 from groundfuse.backend.bundle_cut import Cut
 from groundfuse.backend.bundle_estimate import (
     BundleCamera,
@@ -16,8 +16,8 @@ from groundfuse.backend.bundle_estimate import (
     Estimated,
     MountEstimate,
 )
+from groundfuse.backend.bundle_files import FileTest
 from groundfuse.backend.bundle_findings import findings_of, scale_finding
-from groundfuse.backend.bundle_lens import LensTest
 from groundfuse.backend.bundle_priors import prior_cost
 from groundfuse.backend.bundle_setup import Team
 from groundfuse.backend.bundle_solve import Problem, Solution
@@ -37,15 +37,13 @@ class Ends:
 
 
 def report(
-    ends: Ends, problem: Problem, solution: Solution, clean: Cut, lens: LensTest
+    ends: Ends, problem: Problem, solution: Solution, clean: Cut, test: FileTest
 ) -> BundleEstimate:
     """Collect the answer from the solution."""
     priors, state, team = problem.priors, solution.state, ends.team
-    robots = np.arange(priors.num_frames, priors.num_nodes)
     diagonal = inverse_diagonal(solution.factor)
-    shared = inverse_between(solution.factor, robots)
     sigma = np.sqrt(np.einsum("nii->ni", diagonal)[: priors.num_frames, 3:])
-    mounts = _mounts(ends, problem, solution, shared, lens)
+    mounts = _mounts(ends, problem, test)
     scale_sigma = _scale_sigma(problem, solution)
     return BundleEstimate(
         team=_team_estimate(ends, problem, solution, diagonal),
@@ -55,6 +53,7 @@ def report(
         scale_sigma=scale_sigma,
         residual_px=_residual_px(ends, problem, solution),
         noise_factor=solution.noise,
+        relief=priors.relief,
         num_points=problem.seen.num_points,
         num_observations=len(problem.seen.frame),
         num_links=len(clean.links),
@@ -62,7 +61,7 @@ def report(
         rejected=clean.rejected,
         findings=(
             scale_finding(team.robots, scale_sigma),
-            *findings_of(team, problem, solution, mounts, shared),
+            *findings_of(team, problem, solution, mounts, test),
         ),
     )
 
@@ -114,37 +113,28 @@ def _residual_px(ends: Ends, problem: Problem, solution: Solution) -> float:
     return float(np.sqrt(np.sum(solution.weight * square) / np.sum(solution.weight)))
 
 
-def _mounts(
-    ends: Ends, problem: Problem, solution: Solution, shared: Array, lens: LensTest
-) -> tuple[MountEstimate, ...]:
+def _mounts(ends: Ends, problem: Problem, test: FileTest) -> tuple[MountEstimate, ...]:
     """State what the pictures tell of every robot's camera."""
-    priors, value = problem.priors, solution.state.shared
-    sigmas = np.sqrt(np.diag(shared)).reshape(-1, 6)
-    kept = np.where(lens.freed, sigmas[:, 3:5], lens.sigma)
-    sigmas[:, 3:5] = kept
+    priors = problem.priors
+    used = np.hstack([priors.free_mount, priors.free_lens])
 
     def number(robot: int, axis: int) -> Estimated:
-        sigma, prior = float(sigmas[robot, axis]), float(priors.shared_sigma[axis])
+        sigma, prior = float(test.sigma[robot, axis]), float(priors.shared_sigma[axis])
         told = sigma < ends.options.observed_share * prior
-        return Estimated(float(value[robot, axis]) if told else None, sigma, prior)
+        value = float(test.value[robot, axis]) if told else None
+        return Estimated(value, sigma, prior, bool(used[robot, axis]))
 
     mounts = []
     for robot, name in enumerate(ends.team.robots):
         height = number(robot, 2)
         if int((priors.group_of == priors.group_of[robot]).sum()) == 1:
             # Alone, its height is the scale, which no picture tells.
-            height = Estimated(None, height.prior_sigma, height.prior_sigma)
-        asked = [not math.isnan(sigma) for sigma in sigmas[robot, 3:5].tolist()]
-        mounts.append(
-            MountEstimate(
-                name,
-                number(robot, 0),
-                number(robot, 1),
-                height,
-                number(robot, 3) if asked[0] else None,
-                number(robot, 4) if asked[1] else None,
-            )
+            height = Estimated(None, height.prior_sigma, height.prior_sigma, used=False)
+        focal, distortion = (
+            number(robot, axis) if test.asked[robot, axis] else None for axis in (3, 4)
         )
+        tilt, roll = number(robot, 0), number(robot, 1)
+        mounts.append(MountEstimate(name, tilt, roll, height, focal, distortion))
     return tuple(mounts)
 
 

@@ -106,7 +106,9 @@ def priors_of(
         team.robot_of,
         fixed,
         _scale_groups(team),
+        np.ones((len(team.robots), 3), dtype=np.bool_),
         np.zeros((len(team.robots), 2), dtype=np.bool_),
+        0.0,
     )
 
 
@@ -134,17 +136,18 @@ def start_state(
         np.array(feet).reshape(-1, 3),
         priors.attitude.copy(),
         np.zeros((priors.num_robots, 6)),
-        np.zeros((0, 2)),
+        np.zeros((0, 3)),
     )
 
 
 def with_points(state: State, seen: Observations, robot_of: Integers) -> State:
     """Put each floor point where its sightings meet the floor on average."""
-    found, _ = floor_points(seen.frame, seen.ray, state, robot_of)
+    found = floor_points(seen.frame, seen.ray, state, robot_of).point
     good = np.isfinite(found).all(axis=1)
     times = np.bincount(seen.point[good], minlength=seen.num_points)
     sums = [np.bincount(seen.point[good], found[good, axis], seen.num_points) for axis in range(2)]
-    points = np.stack(sums, axis=1) / np.maximum(times, 1)[:, None]
+    points = np.zeros((seen.num_points, 3))
+    points[:, :2] = np.stack(sums, axis=1) / np.maximum(times, 1)[:, None]
     return State(state.pose, state.attitude, state.shared, points)
 
 

@@ -19,6 +19,7 @@ from groundfuse.backend.bundle_normal import (
     Reduced,
     point_steps,
     reduce_rows,
+    relief_rows,
     right_side,
     whitened_rows,
 )
@@ -42,6 +43,8 @@ UNSEEN_RATIO = 1e4
 """A sighting behind the camera costs as much as one a hundred kernel widths off."""
 CHORD_GAIN = 0.3
 """A step that gains more than this share of the one before asks for new derivatives."""
+LEAST_FREEDOM = 0.9
+"""Points with fewer degrees of freedom say nothing about the noise."""
 NOISE_CHANGE = 0.02
 """So does a noise that has changed by this fraction."""
 
@@ -101,6 +104,7 @@ class Solution:
         weight: (n,) kernel weights, 0 to 1.
         factor: of the reduced system near there, without damping.
         noise: residuals over the promised sigmas, robust.
+        absorbed: (points,) how many residuals each floor point takes.
         steps: accepted steps.
         settled: whether the cost stopped falling.
     """
@@ -110,6 +114,7 @@ class Solution:
     weight: Array
     factor: Factor
     noise: float
+    absorbed: Array
     steps: int
     settled: bool
 
@@ -131,21 +136,31 @@ def errors_of(problem: Problem, state: State) -> Errors:
     return Errors(residual, unseen, chi2)
 
 
-def noise_factor(seen: Observations, errors: Errors) -> float:
+def noise_factor(seen: Observations, errors: Errors, absorbed: Array) -> float:
     """Median residual of the floor points over what the sigmas promise.
 
-    A point seen k times has 2 k residuals and takes 2 of them, which leaves chi-square with
-    2 k - 2 degrees of freedom; its median is near v (1 - 2 / 9 v)^3 (Wilson and Hilferty 1931).
+    A point seen k times has 2 k residuals and absorbs 2 of them, or up to 3 where the floor has
+    relief (`absorbed`, (points,)), which leaves chi-square with v = 2 k - absorbed degrees of
+    freedom; its median is near v (1 - 2 / 9 v)^3 (Wilson and Hilferty 1931).
     """
     total = np.bincount(seen.point, errors.chi2, seen.num_points)
-    freedom = 2.0 * np.bincount(seen.point, ~errors.unseen, seen.num_points) - 2.0
-    total, freedom = total[freedom > 0.0], freedom[freedom > 0.0]
+    freedom = 2.0 * np.bincount(seen.point, ~errors.unseen, seen.num_points) - absorbed
+    several = freedom > LEAST_FREEDOM
+    total, freedom = total[several], freedom[several]
     if len(total) == 0:
         return 1.0
     median = freedom * (1.0 - 2.0 / (9.0 * freedom)) ** 3
     taken = 3.0 * (len(seen.frame_start) - 1)  # each frame's pose absorbs as well
     left = max(freedom.sum() - taken, 1.0) / freedom.sum()
     return float(np.sqrt(np.median(total / median) / left))
+
+
+def _absorbed(problem: Problem, system: "System") -> Array:
+    """How many residuals each floor point absorbs: 2, and of its height what the prior leaves."""
+    absorbed = np.full(problem.seen.num_points, 2.0)
+    if problem.priors.relief > 0.0:
+        absorbed += 1.0 - (system.reduced.rows.relief[1] / system.reduced.root[2, 2]) ** 2
+    return absorbed
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +185,9 @@ class Kernel:
 
 
 def _cost(problem: Problem, state: State, errors: Errors, kernel: Kernel) -> float:
-    return kernel.cost(errors) + prior_cost(state, problem.priors, problem.between)
+    relief = relief_rows(problem.seen, state, problem.priors)[0]
+    priors = prior_cost(state, problem.priors, problem.between)
+    return kernel.cost(errors) + priors + float(relief @ relief)
 
 
 def system_at(
@@ -210,7 +227,9 @@ def step_from(
     weight = kernel.weight(errors) / (kernel.noise * seen.sigma) ** 2
     root = np.sqrt(system.weight)
     scale = np.divide(weight, root, out=np.zeros_like(weight), where=root > 0.0)
-    right, explained = right_side(seen, system.reduced, errors.residual * scale[:, None], priors)
+    error = errors.residual * scale[:, None]
+    relief = relief_rows(seen, state, priors)
+    right, explained = right_side(seen, system.reduced, error, relief, priors)
     right += prior_right(state, priors) + between_right(state, problem.between, priors)
     step = solve(system.factor, right.ravel()).reshape(-1, BLOCK)
     points = point_steps(seen, system.reduced, explained, step, priors)
@@ -230,11 +249,13 @@ def minimise(
         NotPositiveDefiniteError: the unknowns are not determined.
     """
     errors, system, last_gain = errors_of(problem, state), None, np.inf
+    absorbed = np.full(problem.seen.num_points, 2.0)
     damping, steps, done = 0.0, 0, False
     while True:
-        kernel = Kernel(width, noise_factor(problem.seen, errors))
+        kernel = Kernel(width, noise_factor(problem.seen, errors, absorbed))
         if system is None or abs(kernel.noise / system.noise - 1.0) > NOISE_CHANGE:
             system = _damped_system(problem, state, errors, kernel, damping)
+            absorbed = _absorbed(problem, system)
         if done or steps == iterations:
             break
         tried, _ = step_from(problem, system, state, errors, kernel)
@@ -253,7 +274,8 @@ def minimise(
         else:
             done = True
     factor = _factor(problem, system.reduced, 0.0) if system.damping else system.factor
-    return Solution(state, errors, kernel.weight(errors), factor, kernel.noise, steps, done)
+    weight = kernel.weight(errors)
+    return Solution(state, errors, weight, factor, kernel.noise, absorbed, steps, done)
 
 
 def _damped_system(

@@ -25,6 +25,7 @@ MIX = tuple(
     for number in (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9, 0xD6E8FEB86659FD93)
 )
 
+ROUNDING = 1e-9
 PIECE = 4096
 """Sightings worked on at once: their derivatives, 0.4 MB, stay in the second-level cache."""
 
@@ -64,6 +65,7 @@ class Observations:
     Attributes:
         frame: (n,) frame of each.
         point: (n,) floor point of each.
+        first: (points,) the first observation of each floor point.
         ray: (n, 2) measured ray.
         sigma: (n,) one-axis standard deviation.
         num_points: floor points.
@@ -78,6 +80,7 @@ class Observations:
 
     frame: Integers
     point: Integers
+    first: Integers
     ray: Array
     sigma: Array
     num_points: int
@@ -165,6 +168,23 @@ def tracks(links: Links, sightings: Sightings) -> tuple[Integers, Integers]:
     return used[several], renumbered
 
 
+def sampled(
+    used: Integers, point: Integers, sightings: Sightings, most: int
+) -> tuple[Integers, Integers]:
+    """Keep some floor points whole, so that each frame has about `most` sightings or all it had.
+
+    A point is as likely kept as the neediest of its frames asks for.
+    """
+    frame = sightings.frame[used]
+    share = np.minimum(most / np.bincount(frame), 1.0)
+    wanted = np.zeros(int(point.max()) + 1)
+    np.maximum.at(wanted, point, share[frame])
+    total = np.cumsum(wanted)
+    kept = np.floor(total + ROUNDING) > np.floor(total - wanted + ROUNDING)
+    inside = kept[point]
+    return used[inside], np.unique(point[inside], return_inverse=True)[1]
+
+
 def single_links(links: Links) -> tuple[Integers, Integers]:
     """Make every link a floor point of its own: (sighting, point) of every observation."""
     point = np.arange(len(links))
@@ -192,6 +212,7 @@ def observations(
     return Observations(
         frame,
         point,
+        np.unique(point, return_index=True)[1],
         sightings.ray[used],
         sightings.sigma[used],
         int(point.max()) + 1 if len(point) else 0,

@@ -17,6 +17,9 @@ from groundfuse.backend.consistency import Flags, Links
 from groundfuse.backend.problem import Array, Indices, Problem, components
 
 SLACK = 4.0  # the rest of the team is not known exactly: limit of agreement times this
+UNCLEAN = (
+    0.2  # part of the displaced edges a step may leave unexplained, or of fitting ones it cuts
+)
 MAX_CUTS = 3  # different places of a cut that are proposed per map and side
 MAX_EDGES = 250  # edges of one map that are compared all with all
 
@@ -121,6 +124,7 @@ def _separating(
     wrong = _across(maps, nodes, displaced, number, behind=behind)
     right = _across(maps, nodes, fitting, number, behind=behind)
     gain = wrong - right
+    clean = (right <= UNCLEAN * wrong) & (wrong >= (1.0 - UNCLEAN) * len(displaced))
     steps = maps.edge[nodes]
     firmness = np.linalg.slogdet(problem.information[steps])[1]
     order = np.lexsort((steps, firmness, -gain))
@@ -128,7 +132,7 @@ def _separating(
     sides = np.stack([wrong, right], axis=1)[order]
     _, first = np.unique(sides, axis=0, return_index=True)
     best = order[np.sort(first)[:MAX_CUTS]]
-    return {Cut(int(steps[k]), int(gain[k])) for k in best if gain[k] >= 2}
+    return {Cut(int(steps[k]), int(gain[k])) for k in best if gain[k] >= 2 and clean[k]}
 
 
 def _across(maps: Forest, nodes: Indices, edges: Problem, number: int, *, behind: bool) -> Array:

@@ -1,8 +1,9 @@
-"""Which edges belong: graduated non-convexity for truncated least squares, from a voted start.
+"""Which edges belong: graduated non-convexity for truncated least squares, from a believed start.
 
 Yang et al., "Graduated non-convexity for robust spatial perception" (2020), with three changes: the
-start is the solution over edges already believed, every round starts where the last one ended, and
-an edge too far from the start to be plausible is not let in at all.
+start is the solution over the edges already believed, every round starts where the last one ended,
+and an edge is let in only if its error is plausible given how well the believed edges tie its two
+poses together. What is accepted is believed in the next pass, until nothing changes.
 """
 
 from dataclasses import dataclass
@@ -11,9 +12,10 @@ from typing import NamedTuple
 import numpy as np
 
 from groundfuse.backend import planar, sparse
+from groundfuse.backend.chain import spanning_forest
 from groundfuse.backend.consistency import Flags
 from groundfuse.backend.initial import layout_of
-from groundfuse.backend.problem import Array, Problem, chi2_per_edge, components
+from groundfuse.backend.problem import Array, Problem, chi2_per_edge, components, residuals
 from groundfuse.backend.solver import gauss_newton_step, minimise
 
 RIDGE = 1e-9  # keeps the system regular while all edges of a part have lost their weight
@@ -25,15 +27,15 @@ class RobustOptions:
 
     Attributes:
         limit: chi2 (3 degrees of freedom) above which an edge is turned down.
-        reach: an edge not believed at the start is considered up to `reach` times the limit.
         growth: factor of the control parameter per round.
         max_rounds: rounds at most.
+        max_passes: how often what was accepted may let further edges in.
     """
 
     limit: float = 16.27  # 99.9 %
-    reach: float = 100.0
     growth: float = 2.0
     max_rounds: int = 60
+    max_passes: int = 5
 
 
 class Robust(NamedTuple):
@@ -62,23 +64,59 @@ def settle(
         believed: (m,) edges that count at the start; all others start at nothing.
         options: limits.
     """
-    poses = minimise(
-        problem.of(trusted | believed), start, _on(layout, problem, trusted | believed)
-    ).poses
+    poses, accepted = start, trusted | believed
+    for _ in range(options.max_passes):
+        before = accepted
+        poses = minimise(problem.of(accepted), poses, _on(layout, problem, accepted)).poses
+        candidates = ~trusted & (accepted | plausible(problem, poses, accepted, options.limit))
+        poses = _graduated(problem, poses, layout, trusted, candidates, options=options)
+        poses, accepted = _final(problem, poses, layout, trusted, options)
+        if np.array_equal(accepted, before):
+            break
+    return Robust(poses, accepted)
+
+
+def plausible(problem: Problem, poses: Array, believed: Flags, limit: float) -> Flags:
+    """Return whether each edge's error is within `limit` of its own and the believed edges' noise.
+
+    The noise between two poses is that along the best-tied path of a spanning tree, which is never
+    less than that of the whole graph, so no right edge is kept out.
+    """
+    some = problem.of(believed)
+    covariance = planar.inverted(problem.information)
+    forest = spanning_forest(some, np.trace(covariance[believed], axis1=1, axis2=2))
+    together = forest.part[problem.a] == forest.part[problem.b]
+    a, b = problem.a[together], problem.b[together]
+    to_b = planar.adjoint(planar.inverse(forest.poses[b]))
+    noise = covariance[together] + planar.carried(to_b, forest.between(a, b))
+    error = residuals(problem.of(together), poses)
+    flags = np.zeros(len(problem), dtype=bool)
+    flags[together] = planar.mahalanobis2(error, noise) <= limit
+    return flags
+
+
+def _graduated(
+    problem: Problem,
+    poses: Array,
+    layout: sparse.Pattern,
+    trusted: Flags,
+    candidates: Flags,
+    *,
+    options: RobustOptions,
+) -> Array:
+    """Tighten the loss from nearly quadratic to truncated, one Gauss-Newton step per round."""
     error = chi2_per_edge(problem, poses)
-    doubtful = ~trusted
-    open_edges = doubtful & (believed | (error <= options.reach * options.limit))
-    worst = float(error[open_edges].max(initial=0.0))
+    worst = float(error[candidates].max(initial=0.0))
     control = options.limit / max(worst - options.limit, 1e-9 * options.limit)
     for _ in range(options.max_rounds):
-        weights = np.where(open_edges, _weights(error, control, options.limit), trusted * 1.0)
+        weights = np.where(candidates, _weights(error, control, options.limit), trusted * 1.0)
         if np.all((weights < 1e-3) | (weights > 1.0 - 1e-3)):
             break
         step = gauss_newton_step(problem.weighted(weights), poses, layout, RIDGE)
         poses = planar.compose(poses, planar.exp(step.tangent))
         error = chi2_per_edge(problem, poses)
         control *= options.growth
-    return _final(problem, poses, layout, trusted, options)
+    return poses
 
 
 def _final(

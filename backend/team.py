@@ -11,7 +11,7 @@ import numpy as np
 
 from groundfuse.backend import chain, native, planar
 from groundfuse.backend import problem as graph
-from groundfuse.backend.consistency import Flags, against_chain, links
+from groundfuse.backend.consistency import Flags
 from groundfuse.backend.doubt import doubtful_steps
 from groundfuse.backend.initial import held_poses, layout_of
 from groundfuse.backend.measurement import FrameId, RelativePose, TeamEstimate
@@ -35,6 +35,7 @@ class TeamOptions:
         max_cuts: steps of trajectories that may be found wrong and cut.
         max_trials: suspected steps tried before each of them.
         step_trust: a step turned down costs as much as this many other edges.
+        rival_trust: and this many more where overlaps that repeat are another explanation.
         refine_below: graphs of fewer poses than this get their last iterations from gtsam's own
             Gauss-Newton on its own factors, as a second implementation of the same optimum.
     """
@@ -44,7 +45,8 @@ class TeamOptions:
     robust: RobustOptions = field(default_factory=RobustOptions)
     max_cuts: int = 10
     max_trials: int = 12
-    step_trust: float = 3.0
+    step_trust: float = 2.0
+    rival_trust: float = 2.5
     refine_below: int = 20_000
 
 
@@ -93,7 +95,6 @@ def _joined(team: Team, steps: Flags, options: TeamOptions, *, guess: bool) -> F
     on_chain[maps.edge[maps.edge >= 0]] = True
     inner = maps.part[whole.a] == maps.part[whole.b]
     believed, undecided = on_chain.copy(), np.zeros(len(whole), dtype=bool)
-    believed[inner] |= _fits(whole.of(inner), maps, options.robust.limit)
     meetings, verdict = None, None
     if not inner.all():
         meetings = skeleton(_upwards(whole.of(~inner), maps.part), maps)
@@ -111,8 +112,10 @@ def _with_a_cut(
 ) -> tuple[Findings, Flags] | None:
     """Return the best result with one step less, if it explains the edges better."""
     limit = options.robust.limit
+    rival = found.verdict is not None and bool(found.verdict.rivals)
+    needed = limit * (options.rival_trust if rival else 0.5)
     cuts = doubtful_steps(team.problem, found.maps, found.poses, found.accepted, limit)
-    best, lowest = None, _truncated(found, team.is_step, options) - limit
+    best, lowest = None, _truncated(found, team.is_step, options) - needed
     for cut in cuts[: options.max_trials]:
         fewer = steps.copy()
         fewer[cut.edge] = False
@@ -136,11 +139,6 @@ def _refined(found: Findings, options: TeamOptions) -> Array:
     if found.whole.num_poses >= options.refine_below or not len(kept):
         return found.poses
     return native.refined(kept, held_poses(kept), found.poses)
-
-
-def _fits(loops: Problem, maps: chain.Forest, limit: float) -> Flags:
-    """Return whether edges within maps agree with their chain."""
-    return against_chain(links(loops, maps), maps) <= limit
 
 
 def _upwards(overlaps: Problem, part: Indices) -> Problem:

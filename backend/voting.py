@@ -3,9 +3,9 @@
 An assignment joins the maps by one hypothesis per join; every other overlap then agrees with it or
 does not. Its score counts closures (pairs of maps that agree beyond what a tree needs; closing by
 chance is rare however many overlaps repeat the same mistake) far above support, and support only by
-its logarithm, so that only a clear majority decides between two maps that nobody else sees.
-Assignments whose score is within `log(ambiguity_ratio)` of the best are open: only what all of them
-agree on is used.
+its logarithm, so that only a clear majority decides between two maps that nobody else sees. Rivals
+whose support is within `ambiguity_ratio` of the best one's stay open: only what all of them agree on
+is used.
 """
 
 import math
@@ -49,11 +49,15 @@ class Assignment:
         tree: candidate edges that join the maps, no cycle among them.
         agreeing: (m,) whether each candidate agrees with the tree.
         score: closures and support, in natural-log units.
+        closures: pairs of maps that agree beyond those of the tree.
+        support: agreeing candidates per pair of maps that has any.
     """
 
     tree: Indices
     agreeing: Flags
     score: float
+    closures: int
+    support: dict[tuple[int, int], int]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,14 +87,23 @@ def vote(team: Skeleton, options: VotingOptions) -> Vote:
         if rival.score > best.score:
             best, rival = rival, best
         rivals.append(rival)
-    margin = math.log(options.ambiguity_ratio) + 1e-9
-    open_rivals = tuple(r for r in rivals if r.score >= best.score - margin and _differ(r, best))
+    open_rivals = tuple(r for r in rivals if _is_open(r, best, options.ambiguity_ratio))
     sure = np.logical_and.reduce([best.agreeing, *(r.agreeing for r in open_rivals)])
     return Vote(best, open_rivals, sure)
 
 
-def _differ(one: Assignment, two: Assignment) -> bool:
-    return not np.array_equal(one.agreeing, two.agreeing)
+def _is_open(rival: Assignment, best: Assignment, ratio: float) -> bool:
+    """Return whether the data leave a rival possible.
+
+    It closes as many cycles, and its support is within `ratio` of the best one's, in the geometric
+    mean over the pairs of maps where they differ: a displaced map brings all its pairs at once, so
+    they are one piece of evidence and not many.
+    """
+    if np.array_equal(rival.agreeing, best.agreeing) or rival.closures < best.closures:
+        return False
+    pairs = rival.support.keys() | best.support.keys()
+    differing = sum(rival.support.get(p) != best.support.get(p) for p in pairs)
+    return rival.score >= best.score - (math.log(ratio) + 1e-9) * max(1, differing)
 
 
 def _alternatives(
@@ -139,6 +152,10 @@ def scored(team: Skeleton, tree: Indices, limit: float) -> Assignment:
     forest: Forest = joined(team, tree)
     agreeing = chi2_of_joins(team, forest) <= limit
     key = team.maps[agreeing, 0] * team.num_maps + team.maps[agreeing, 1]
-    _, support = np.unique(key, return_counts=True)
+    pairs, support = np.unique(key, return_counts=True)
     closures = len(support) - len(tree)
-    return Assignment(tree, agreeing, CLOSURE * closures + float(np.log(support).sum()))
+    score = CLOSURE * closures + float(np.log(support).sum())
+    split = (divmod(pair, team.num_maps) for pair in pairs.tolist())
+    return Assignment(
+        tree, agreeing, score, closures, dict(zip(split, support.tolist(), strict=True))
+    )

@@ -102,6 +102,7 @@ def simulate(
     min_common=25,
     detect=0.7,
     odometry=False,
+    relief=None,
 ):
     """Simulate a team; keypoint noise belongs to a frame's keypoint and is shared by its pairs."""
     prior_sigma = prior_sigma or wobble
@@ -109,6 +110,7 @@ def simulate(
     reach = 3.0 * max(robot.height_m for robot in robots)
     low, high = paths.min(axis=0) - reach, paths.max(axis=0) + reach
     floor = rng.uniform(low, high, (int(density * np.prod(high - low)), 2))
+    tall = relief(floor, rng) if relief else np.zeros(len(floor))
     tree = cKDTree(floor)
     views, truth, attitude, prior = {}, {}, {}, {}
     for robot in robots:
@@ -124,7 +126,7 @@ def simulate(
             foot = truth[frame] @ robot.base_from_foot
             near = np.array(tree.query_ball_point([foot.x_m, foot.y_m], reach))
             in_foot = foot.inverse().apply(floor[near])
-            rays = rays_from_floor(attitude[frame], in_foot)
+            rays = rays_over_relief(attitude[frame], in_foot, tall[near])
             rays = rays * robot.focal_factor * (1 + robot.distortion * (rays**2).sum(1))[:, None]
             seen = (np.abs(rays) < HALF_VIEW).all(axis=1) & (rng.random(len(rays)) < detect)
             rays = rays[seen] + rng.normal(0, noise_px / FOCAL_PX, (seen.sum(), 2))
@@ -164,6 +166,12 @@ def simulate(
     start = TeamEstimate(poses, component_of, cov, anchors, (), 0.0, 0)
     cameras = {name: BundleCamera(m, FOCAL_PX) for name, m in mount.items()}
     return World(start, edges, prior, dict.fromkeys(frames, prior_sigma), cameras, truth, attitude)
+
+
+def rays_over_relief(attitude, in_foot, tall_m):
+    """Rays to points above the floor: a camera at height h sees them as one at h - z would."""
+    shrunk = in_foot * (attitude.height_m / (attitude.height_m - tall_m))[:, None]
+    return rays_from_floor(attitude, shrunk)
 
 
 def nominal(robot):

@@ -46,7 +46,10 @@ def seen_from(pose, attitude, lens, seed):
     shared = np.zeros((2, 6))
     shared[1, 3:5] = lens
     state = State(
-        np.array([(0.0, 0.0, 0.0), pose]), np.array([(0.1, 0.0, 1.0), attitude]), shared, floor
+        np.array([(0.0, 0.0, 0.0), pose]),
+        np.array([(0.1, 0.0, 1.0), attitude]),
+        shared,
+        np.pad(floor, ((0, 0), (0, 1))),
     )
     return seen, state
 
@@ -62,7 +65,7 @@ def test_the_truth_has_no_residual(pose, attitude, lens, seed):
 @given(poses, attitudes, attitudes, st.integers(0, 99))
 def test_derivatives_agree_with_the_transfer(pose, attitude, other, seed):
     seen, state = seen_from(pose, attitude, (0.0, 0.0), seed)
-    floor = state.point[seen.point]
+    floor = state.point[seen.point, :2]
     rays_a = rays_from_floor(Attitude(*other), floor)
     good = np.isfinite(rays_a).all(axis=1) & (np.abs(rays_a) < 2.0).all(axis=1)
     expected = transfer(rays_a, np.array(other), np.array(pose), np.array(attitude))
@@ -76,6 +79,7 @@ def test_derivatives_agree_with_the_transfer(pose, attitude, other, seed):
 @given(poses, attitudes, lenses, st.integers(0, 99))
 def test_derivatives_agree_with_differences(pose, attitude, lens, seed):
     seen, state = seen_from(pose, attitude, lens, seed)
+    state.point[:, 2] = np.random.default_rng(seed).normal(0, 0.02, len(state.point))
     whole = slice(0, len(seen.frame))
     view = view_of(seen, state, whole)
     found = through_lens(derivatives(view), view, state.shared[ROBOT_OF[seen.frame]])
@@ -92,7 +96,7 @@ def test_derivatives_agree_with_differences(pose, attitude, lens, seed):
 
     cases = [(found.by_frame[k], lambda s, k=k: changed(1, k, s)) for k in range(6)]
     cases += [(found.by_lens[k], lambda s, k=k: changed(3, 3 + k, s)) for k in range(2)]
-    cases += [(found.by_point[k], lambda s, k=k: point_changed(k, s)) for k in range(2)]
+    cases += [(found.by_point[k], lambda s, k=k: point_changed(k, s)) for k in range(3)]
     for analytic, at in cases:
         numeric = (at(-STEP) - at(STEP)) / (2 * STEP)  # a residual falls as the prediction grows
         assert (np.abs(analytic - numeric) / (1 + np.abs(analytic)) < TOLERANCE_DERIVATIVE).all()
@@ -101,14 +105,16 @@ def test_derivatives_agree_with_differences(pose, attitude, lens, seed):
 @given(poses, attitudes, st.integers(0, 99))
 def test_rays_meet_the_floor_where_the_front_end_says(pose, attitude, seed):
     seen, state = seen_from(pose, attitude, (0.0, 0.0), seed)
-    points, by_ray = floor_points(seen.frame, seen.ray, state, ROBOT_OF)
+    found = floor_points(seen.frame, seen.ray, state, ROBOT_OF)
     expected = Se2(*pose).apply(floor_from_rays(Attitude(*attitude), seen.ray))
-    np.testing.assert_allclose(points, expected, atol=TOLERANCE_RAY * 100)
+    np.testing.assert_allclose(found.point, expected, atol=TOLERANCE_RAY * 100)
+    foot = np.array(pose[:2])
+    np.testing.assert_allclose(found.point, foot + found.slope * attitude[2], atol=1e-12)
     for axis in range(2):
         step = np.eye(2)[axis] * STEP
-        plus, _ = floor_points(seen.frame, seen.ray + step, state, ROBOT_OF)
-        minus, _ = floor_points(seen.frame, seen.ray - step, state, ROBOT_OF)
-        numeric, analytic = (plus - minus) / (2 * STEP), by_ray[:, :, axis]
+        plus = floor_points(seen.frame, seen.ray + step, state, ROBOT_OF).point
+        minus = floor_points(seen.frame, seen.ray - step, state, ROBOT_OF).point
+        numeric, analytic = (plus - minus) / (2 * STEP), found.by_ray[:, :, axis]
         scale = 1.0 + np.abs(analytic) ** 1.5  # the third derivative grows faster than the first
         assert (np.abs(analytic - numeric) / scale < 10 * TOLERANCE_DERIVATIVE).all()
 
@@ -116,11 +122,11 @@ def test_rays_meet_the_floor_where_the_front_end_says(pose, attitude, seed):
 def test_the_lens_is_taken_off_before_rays_meet_the_floor():
     # The inverse is to first order in the distortion: 0.01^2 x radius^4 of a ray of length 0.5.
     seen, state = seen_from((0.3, -0.2, 1.0), (0.5, 0.05, 0.8), (0.01, 0.01), 1)
-    points, _ = floor_points(seen.frame, seen.ray, state, ROBOT_OF)
-    np.testing.assert_allclose(points, state.point[seen.point], atol=3e-3)
-    plain, _ = floor_points(seen.frame, seen.ray, with_shared(state, 0.0), ROBOT_OF)
-    off, better = np.abs(plain - state.point[seen.point]), np.abs(points - state.point[seen.point])
-    assert better.max() < off.max() / 20
+    true = state.point[seen.point, :2]
+    points = floor_points(seen.frame, seen.ray, state, ROBOT_OF).point
+    np.testing.assert_allclose(points, true, atol=3e-3)
+    plain = floor_points(seen.frame, seen.ray, with_shared(state, 0.0), ROBOT_OF).point
+    assert np.abs(points - true).max() < np.abs(plain - true).max() / 20
 
 
 def with_shared(state, value):
@@ -129,18 +135,28 @@ def with_shared(state, value):
 
 def test_a_point_behind_the_camera_is_unseen():
     seen, state = seen_from((0.0, 0.0, 0.0), (0.8, 0.0, 0.5), (0.0, 0.0), 2)
-    away = State(state.pose, state.attitude, state.shared, state.point - np.array([50.0, 0.0]))
+    away = State(state.pose, state.attitude, state.shared, state.point - np.array([50.0, 0.0, 0.0]))
     _, unseen = residuals(seen, away, ROBOT_OF)
     assert unseen.all()
-    points, _ = floor_points(np.array([1]), np.array([[0.0, -3.0]]), state, ROBOT_OF)
-    assert np.isnan(points).all()
+    landing = floor_points(np.array([1]), np.array([[0.0, -3.0]]), state, ROBOT_OF)
+    assert np.isnan(landing.point).all()
+
+
+def test_a_point_above_the_floor_is_seen_as_by_a_lower_camera():
+    seen, state = seen_from((0.2, 0.1, -2.0), (0.6, 0.1, 0.9), (0.0, 0.0), 3)
+    raised, lowered = state.point.copy(), state.attitude.copy()
+    raised[:, 2], lowered[1, 2] = 0.2, 0.7
+    found, _ = residuals(seen, State(state.pose, state.attitude, state.shared, raised), ROBOT_OF)
+    wanted, _ = residuals(seen, State(state.pose, lowered, state.shared, state.point), ROBOT_OF)
+    np.testing.assert_allclose(found, wanted, atol=1e-14)
 
 
 def test_a_step_perturbs_the_pose_on_the_right():
     pose = Se2(0.4, -0.3, 2.0)
-    state = State(np.array([pose.vector()]), np.zeros((1, 3)), np.zeros((1, 6)), np.zeros((0, 2)))
+    state = State(np.array([pose.vector()]), np.zeros((1, 3)), np.zeros((1, 6)), np.ones((1, 3)))
     step = np.array([[1e-3, -2e-3, 0.01, 0.1, 0.2, 0.3], [0.0, 0.0, 0.0, 0.5, 0.6, 0.0]])
-    after = moved(state, step, np.zeros((0, 2)))
+    after = moved(state, step, np.array([[0.5, 0.25]]))
+    np.testing.assert_array_equal(after.point, [[1.5, 1.25, 1.0]])
     expected = pose @ Se2(1e-3, -2e-3, 0.0) @ Se2(0.0, 0.0, 0.01)
     np.testing.assert_allclose(after.pose[0], expected.vector(), atol=1e-15)
     np.testing.assert_array_equal(after.attitude, [[0.1, 0.2, 0.3]])

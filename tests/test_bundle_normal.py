@@ -34,7 +34,7 @@ STEP = 1e-6
 TOLERANCE = 5e-5
 
 
-def problem(seed, *, lens=True, between=True):
+def problem(seed, *, lens=True, between=True, mount=True, relief=0.0):
     """A small problem away from its optimum: two robots, five frames that see most points."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(-0.5, 0.5, (NUM_POINTS, 2))
@@ -62,7 +62,9 @@ def problem(seed, *, lens=True, between=True):
         np.array([0, 0, 0, 1, 1]),
         np.arange(NUM_FRAMES) == 1,
         np.array([0, 0]),
+        np.full((NUM_ROBOTS, 3), mount),
         np.array([[lens, False], [lens, lens]]),
+        relief,
     )
     i, j = np.array([0, 4, 1])[: 3 * between], np.array([2, 3, 0])[: 3 * between]
     relative = [(Se2(*pose[b]).inverse() @ Se2(*pose[a])).inverse() for a, b in zip(i, j)]  # noqa: B905
@@ -72,9 +74,14 @@ def problem(seed, *, lens=True, between=True):
     state = State(
         pose + rng.normal(0, 1e-3, pose.shape) * ~priors.fixed[:, None],
         attitude + rng.normal(0, 1e-3, attitude.shape),
-        rng.normal(0, 1e-3, (NUM_ROBOTS, 6)) * np.array([1, 1, 1, 0, 0, 0])
+        rng.normal(0, 1e-3, (NUM_ROBOTS, 6)) * np.array([mount, mount, mount, 0, 0, 0])
         + np.pad(priors.free_lens * 2e-3, ((0, 0), (3, 1))),
-        points + rng.normal(0, 1e-3, points.shape),
+        np.column_stack(
+            [
+                points + rng.normal(0, 1e-3, points.shape),
+                rng.normal(0, relief / 2, NUM_POINTS),
+            ]
+        ),
     )
     return problem_of(seen, priors, edges), state
 
@@ -90,8 +97,18 @@ def stacked(task, state, weight):
             between_residual(state, task.between).ravel(),
             (state.shared / task.priors.shared_sigma).ravel(),
             np.bincount(task.priors.group_of, state.shared[:, 2]) / SCALE_GAUGE_SIGMA,
+            *relief_residual(task, state),
         ]
     )
+
+
+def relief_residual(task, state):
+    """Heights of the points over what the first camera's height allows them."""
+    if task.priors.relief == 0.0:
+        return []
+    first = [int(np.flatnonzero(task.seen.point == p)[0]) for p in range(NUM_POINTS)]
+    height = state.attitude[task.seen.frame[first], 2]
+    return [state.point[:, 2] / (task.priors.relief * height)]
 
 
 def dense_step(task, state, weight):
@@ -99,26 +116,31 @@ def dense_step(task, state, weight):
     free = np.ones((task.priors.num_nodes, 6), dtype=bool)
     free[:NUM_FRAMES][task.priors.fixed, :3] = False
     free[NUM_FRAMES:, 3:5] = task.priors.free_lens
+    size = 3 if task.priors.relief > 0.0 else 2
     free[NUM_FRAMES:, 5] = False
     unknowns = int(free.sum())
 
     def at(vector):
         step = np.zeros(free.shape)
         step[free] = vector[:unknowns]
-        return stacked(task, moved(state, step, vector[unknowns:].reshape(-1, 2)), weight)
+        return stacked(task, moved(state, step, vector[unknowns:].reshape(-1, size)), weight)
 
-    size = unknowns + 2 * NUM_POINTS
-    columns = [(at(u) - at(-u)) / (2 * STEP) for u in np.eye(size) * STEP]
-    solution, *_ = np.linalg.lstsq(np.stack(columns, axis=1), -at(np.zeros(size)), rcond=None)
+    total = unknowns + size * NUM_POINTS
+    columns = [(at(u) - at(-u)) / (2 * STEP) for u in np.eye(total) * STEP]
+    solution, *_ = np.linalg.lstsq(np.stack(columns, axis=1), -at(np.zeros(total)), rcond=None)
     step = np.zeros(free.shape)
     step[free] = solution[:unknowns]
-    return step, solution[unknowns:].reshape(-1, 2), columns, free
+    return step, solution[unknowns:].reshape(-1, size), columns, free
 
 
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize(("lens", "between"), [(True, True), (False, True), (True, False)])
-def test_a_step_is_the_dense_least_squares_step(seed, lens, between):
-    task, state = problem(seed, lens=lens, between=between)
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"lens": False}, {"between": False}, {"mount": False}, {"relief": 0.01}],
+    ids=lambda options: next(iter(options), "all"),
+)
+def test_a_step_is_the_dense_least_squares_step(seed, options):
+    task, state = problem(seed, **options)
     errors = errors_of(task, state)
     kernel = Kernel(3.0, 1.0)
     system = system_at(task, state, errors, kernel, 0.0)
@@ -127,12 +149,15 @@ def test_a_step_is_the_dense_least_squares_step(seed, lens, between):
     scale = np.abs(expected).max()
     np.testing.assert_allclose(step, expected, atol=TOLERANCE * scale)
     np.testing.assert_allclose(
-        after.point - state.point, points, atol=TOLERANCE * np.abs(points).max()
+        (after.point - state.point)[:, : points.shape[1]],
+        points,
+        atol=TOLERANCE * np.abs(points).max(),
     )
 
 
-def test_the_reduced_system_is_the_schur_complement():
-    task, state = problem(5)
+@pytest.mark.parametrize("relief", [0.0, 0.01])
+def test_the_reduced_system_is_the_schur_complement(relief):
+    task, state = problem(5, relief=relief)
     errors = errors_of(task, state)
     kernel = Kernel(3.0, 1.0)
     reduced = system_at(task, state, errors, kernel, 0.0).reduced
@@ -181,7 +206,7 @@ def test_a_start_far_away_ends_at_the_same_place():
     nudge = rng.normal(0, 0.05, (task.priors.num_nodes, 6))
     nudge[NUM_FRAMES:] = 0.0
     nudge[:NUM_FRAMES][task.priors.fixed, :3] = 0.0
-    away = moved(state, nudge, rng.normal(0, 0.1, state.point.shape))
+    away = moved(state, nudge, rng.normal(0, 0.1, (NUM_POINTS, 2)))
     far = minimise(task, away, width=3.0, iterations=60, settled=1e-9)
     np.testing.assert_allclose(far.state.pose, near.state.pose, atol=1e-6)
 
@@ -212,4 +237,4 @@ def test_the_noise_factor_is_one_for_promised_noise():
     left_over = (noise - mean[point])[order]
     chi2 = np.sum(left_over**2, axis=1) / 1e-6
     errors = Errors(left_over, np.zeros(len(frame), dtype=bool), chi2)
-    assert 1.85 < noise_factor(seen, errors) < 2.15
+    assert 1.85 < noise_factor(seen, errors, np.full(400, 2.0)) < 2.15

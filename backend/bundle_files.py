@@ -1,0 +1,112 @@
+"""Whether the pictures contradict the camera files, and the bundle with better numbers; numpy only.
+
+An unknown that the pictures hardly tell costs accuracy and gains nothing, so a mount and a lens
+stay as filed unless the first step of freeing them is significant. The step also tells what the
+numbers would be, with their sigmas, whether they are used or not.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from groundfuse.backend.bundle_cholesky import inverse_between
+from groundfuse.backend.bundle_estimate import BundleOptions, Refine
+from groundfuse.backend.bundle_model import State
+from groundfuse.backend.bundle_priors import Priors
+from groundfuse.backend.bundle_solve import (
+    Kernel,
+    Problem,
+    Solution,
+    minimise,
+    step_from,
+    system_at,
+)
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+MOUNT, LENS = slice(0, 3), slice(3, 5)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FileTest:
+    """What the pictures tell of mounts and lenses, with all of them free.
+
+    Attributes:
+        value: (robots, 6) corrections of the files, as in `State.shared`.
+        covariance: (6 robots, 6 robots) of them.
+        asked: (robots, 5) which were asked for.
+    """
+
+    value: Array
+    covariance: Array
+    asked: Mask
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations (robots, 6)."""
+        return np.sqrt(np.diag(self.covariance)).reshape(-1, 6)
+
+
+def files_test(problem: Problem, solution: Solution, options: BundleOptions) -> FileTest:
+    """Take one step with everything free that was asked for."""
+    priors = problem.priors
+    lens = np.array([options.focal, options.distortion]) != Refine.NEVER
+    asked = np.tile(np.concatenate([[True] * 3, lens]), (priors.num_robots, 1))
+    trial = replace(problem, priors=freed_priors(priors, asked))
+    kernel = Kernel(options.robust_sigma, solution.noise)
+    system = system_at(trial, solution.state, solution.errors, kernel, 0.0)
+    _, step = step_from(trial, system, solution.state, solution.errors, kernel)
+    robots = np.arange(priors.num_frames, priors.num_nodes)
+    value = solution.state.shared + step[robots]
+    return FileTest(value, inverse_between(system.factor, robots), asked)
+
+
+def freed_priors(priors: Priors, free: Mask) -> Priors:
+    """Return priors with the numbers `free` (robots, 5) unknown."""
+    return replace(priors, free_mount=free[:, MOUNT], free_lens=free[:, LENS])
+
+
+def contradicted(test: FileTest, priors: Priors, options: BundleOptions) -> Mask:
+    """Which numbers (robots, 5) to estimate.
+
+    Where one mount is contradicted all are freed, for the others are no better founded; a kind of
+    lens number likewise, where it is told.
+    """
+    sigma, value = test.sigma[:, :5], test.value[:, :5]
+    told = sigma < options.observed_share * priors.shared_sigma[:5]
+    significant = test.asked & told & (np.abs(value) > options.file_gate_sigma * sigma)
+    free = np.zeros_like(test.asked)
+    free[:, MOUNT] = significant[:, MOUNT].any()
+    free[:, LENS] = told[:, LENS] & significant[:, LENS].any(axis=0)
+    always = np.array([options.focal, options.distortion]) == Refine.ALWAYS
+    free[:, LENS] |= always
+    return free & test.asked
+
+
+def as_filed(state: State, free: Mask) -> State:
+    """Put the numbers that are not `free` (robots, 5) back to the files'."""
+    shared = np.where(np.pad(free, ((0, 0), (0, 1))), state.shared, 0.0)
+    return State(state.pose, state.attitude, shared, state.point)
+
+
+def with_better_files(
+    problem: Problem, solution: Solution, options: BundleOptions, settled: float
+) -> tuple[Problem, Solution, FileTest]:
+    """Free what the pictures contradict, solve again, and tell what all of them would be."""
+    test = files_test(problem, solution, options)
+    priors = problem.priors
+    already = np.hstack([priors.free_mount, priors.free_lens])
+    free = already | contradicted(test, priors, options)
+    if (free == already).all():
+        return problem, solution, test
+    problem = replace(problem, priors=freed_priors(priors, free))
+    solution = minimise(
+        problem,
+        solution.state,
+        width=options.robust_sigma,
+        iterations=options.iterations,
+        settled=settled,
+    )
+    return problem, solution, files_test(problem, solution, options)

@@ -1,0 +1,62 @@
+"""Whether the floor is flat; numpy only.
+
+A flat floor fixes every camera's tilt, roll and height to a few thousandths; a floor that waves by
+a millimetre makes the same bundle wrong by several and far too sure of it. So a trial on part of
+the sightings frees the heights of the floor points, and keeps them where the residuals then fall by
+more than the unknowns account for (an F test, Fisher 1922, on residuals clipped at the kernel).
+"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from groundfuse.backend.bundle_estimate import BundleOptions, Refine
+from groundfuse.backend.bundle_model import State
+from groundfuse.backend.bundle_solve import Problem, Solution, minimise
+
+GATE_SIGMA = 3.0
+MARGIN = 0.01
+"""Residuals must fall by so many sigmas of their own variance, and by this fraction besides."""
+
+
+def misfit(problem: Problem, solution: Solution, clip: float) -> tuple[float, float]:
+    """Mean square residual over the promise, each clipped, and its degrees of freedom."""
+    total = float(np.minimum(solution.errors.chi2, clip).sum())
+    freedom = 2.0 * len(problem.seen.frame) - float(solution.absorbed.sum())
+    freedom -= 3.0 * problem.priors.num_frames
+    return total / max(freedom, 1.0), max(freedom, 1.0)
+
+
+def explains_more(
+    flatter: tuple[Problem, Solution], rougher: tuple[Problem, Solution], width: float
+) -> bool:
+    """Whether the rougher floor lowers the residuals by more than its unknowns account for."""
+    clip = (width * flatter[1].noise) ** 2
+    before, _ = misfit(*flatter, clip)
+    after, freedom = misfit(*rougher, clip)
+    return before > after * (1.0 + MARGIN + GATE_SIGMA * math.sqrt(2.0 / freedom))
+
+
+def settle_relief(
+    problem: Problem, solution: Solution, options: BundleOptions, settled: float
+) -> tuple[float, State]:
+    """Return the relief that the sightings ask for, 0 for a flat floor, and the state with it."""
+    if options.relief is Refine.NEVER:
+        return 0.0, solution.state
+    best = problem, solution
+    levels = options.relief_levels
+    for level in levels[-1:] if options.relief is Refine.ALWAYS else levels:
+        rougher = replace(problem, priors=replace(problem.priors, relief=level))
+        found = minimise(
+            rougher,
+            best[1].state,
+            width=options.robust_sigma,
+            iterations=options.iterations,
+            settled=settled,
+        )
+        better = explains_more(best, (rougher, found), options.robust_sigma)
+        if not better and options.relief is not Refine.ALWAYS:
+            break
+        best = rougher, found
+    return best[0].priors.relief, best[1].state
