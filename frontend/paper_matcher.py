@@ -108,12 +108,14 @@ def detect(
     view, mask = overhead_view(image, camera, attitude, grid)
     corners = find_corners(_grey(image), camera, attitude, grid, options.corners)
     rays = camera.intrinsics.rays_from_px(corners.px)
+    on_floor = np.isfinite(floor_from_rays(attitude, rays)).all(axis=1)
+    rays, sigma_px = rays[on_floor], corners.sigma_px[on_floor]
     floor_m = floor_from_rays(attitude, rays)
     overhead_px = grid.overhead_from_floor(floor_m)
     smooth = cv2.GaussianBlur(_grey(view).astype(np.float32), (0, 0), options.profile_sigma_cells)
     return PaperFeatures(
         rays,
-        corners.sigma_px / camera.intrinsics.focal_px,
+        sigma_px / camera.intrinsics.focal_px,
         floor_m,
         overhead_px,
         invariants(view, mask, overhead_px, options.invariants),

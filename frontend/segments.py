@@ -38,6 +38,8 @@ class SegmentOptions:
     """Part of the tolerance of equal length that the corners need, overhead cells."""
     length_tolerance_ratio: float = 0.015
     """Part that the wobble needs, over the length."""
+    max_segments: int = 3000
+    """Most matched segments that vote: the first ones drawn."""
     num_steps: int = 8
     """k: profiles are sampled at k + 1 points."""
     min_correlation: float = 0.8
@@ -118,11 +120,13 @@ def profile(view: SegmentView, start: np.ndarray, end: np.ndarray, num_steps: in
 
     Each has mean 0 and length 1 (or 0 if it is flat), so products are correlations.
     """
+    if len(start) == 0:
+        return np.zeros((0, num_steps + 1))
     along = np.linspace(0.0, 1.0, num_steps + 1)[None, :, None]
     first, last = view.overhead_px[start][:, None], view.overhead_px[end][:, None]
     at = (first + along * (last - first)).astype(np.float32)
     # remap takes fewer than 32767 rows: lay the segments out in a wide picture.
-    rows = max(1, min(len(at), 4096))
+    rows = min(len(at), 4096)
     columns = -(-len(at) // rows)
     padded = np.zeros((rows * columns, num_steps + 1, 2), np.float32)
     padded[: len(at)] = at
@@ -150,7 +154,8 @@ def matched_segments(scene: Scene, options: SegmentOptions, rng: np.random.Gener
     profile_a = profile(a, candidates.a[one], candidates.a[two], options.num_steps)
     profile_b = profile(b, candidates.b[one], candidates.b[two], options.num_steps)
     alike = (profile_a * profile_b).sum(axis=1) > options.min_correlation  # eq. 5
-    return np.stack([one[alike], two[alike]], axis=1)
+    matched: np.ndarray = np.stack([one[alike], two[alike]], axis=1)
+    return matched[: options.max_segments]
 
 
 def _drawn(
