@@ -17,6 +17,8 @@ REPEATS = 0.5
 WORKING_PX = 160
 MIN_OVERLAP = 0.3
 MAIN_LOBE_SHARE = 0.06
+FAINTEST = 0.05
+"""Standard deviation below which a view holds no floor but rounding: a blank picture."""
 
 
 def repetition(normalised: Picture32, mask: Mask) -> float:
@@ -43,7 +45,7 @@ def repetition(normalised: Picture32, mask: Mask) -> float:
         *np.ogrid[-(rows // 2) : rows - rows // 2, -(columns // 2) : columns - columns // 2]
     )
     counted = (overlap > MIN_OVERLAP * weight.sum()) & (away > MAIN_LOBE_SHARE * max(size))
-    counted &= norm > 1e-6 * max(float(norm.max()), 1e-12)
+    counted &= norm > FAINTEST**2 * overlap
     if not counted.any():
         return 0.0
     return float(np.clip((product[counted] / norm[counted]).max(), 0.0, 1.0))
