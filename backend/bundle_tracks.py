@@ -176,7 +176,7 @@ def sampled(
     A point is as likely kept as the neediest of its frames asks for.
     """
     frame = sightings.frame[used]
-    share = np.minimum(most / np.bincount(frame), 1.0)
+    share = np.minimum(most / np.maximum(np.bincount(frame), 1), 1.0)
     wanted = np.zeros(int(point.max()) + 1)
     np.maximum.at(wanted, point, share[frame])
     total = np.cumsum(wanted)

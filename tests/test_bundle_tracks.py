@@ -12,6 +12,7 @@ from groundfuse.backend.bundle_tracks import (
     Sightings,
     observations,
     pieces,
+    sampled,
     sightings_from_edges,
     single_links,
     thinned,
@@ -142,6 +143,27 @@ def test_observations_list_every_pair_once(num_frames, num_points, seed):
             got.append((int(seen.frame[i]), int(seen.frame[j]), int(seen.point[i])))
     assert len(got) == len(expected)
     assert set(got) == expected
+
+
+@given(st.integers(2, 8), st.integers(1, 60), st.integers(1, 30), st.integers(0, 99))
+def test_a_sample_keeps_points_whole_and_frames_rich(num_frames, num_points, most, seed):
+    rng = np.random.default_rng(seed)
+    frame, point = np.nonzero(rng.random((num_frames, num_points)) < 0.5)
+    sightings = Sightings(frame, np.zeros((len(frame), 2)), np.ones(len(frame)))
+    if len(frame) == 0:
+        return
+    _, point = np.unique(point, return_inverse=True)
+    used, number = sampled(np.arange(len(frame)), point, sightings, most)
+    kept = set(point[used].tolist())
+    assert len(used) == np.isin(point, list(kept)).sum()  # all sightings of a kept point
+    assert number.max() + 1 == len(kept)
+    assert len(set(zip(number.tolist(), point[used].tolist(), strict=True))) == len(kept)
+    before, after = np.bincount(frame), np.bincount(frame[used], minlength=len(np.bincount(frame)))
+    if (before <= most).all():
+        assert len(used) == len(frame)
+    # A frame's points are kept with at least its own share each; rounding of the running total
+    # takes at most one, and neighbours of other shares move it by a few.
+    assert (after >= np.minimum(before, most) / 2 - 3).all()
 
 
 def test_single_links_share_nothing():
