@@ -23,8 +23,11 @@ from groundfuse.tools.drift_table import drift_record
 from groundfuse.tools.errors import TeamError
 from groundfuse.tools.files import make_folder, write_atomic
 from groundfuse.tools.front_end import Matcher, Result, with_matcher
+from groundfuse.tools.open3d_check import check_with_open3d
 from groundfuse.tools.outputs import (
     check_names,
+    component_name,
+    write_attitudes,
     write_graphs,
     write_json,
     write_pairs,
@@ -44,6 +47,7 @@ from groundfuse.tools.pipeline import (
 )
 from groundfuse.tools.settings import record, with_settings
 from groundfuse.tools.team_folder import list_robots, read_team
+from groundfuse.tools.view3d import view_ply, write_ply
 
 SAMPLE = Path(__file__).resolve().parent.parent / "data" / "team"
 EPILOG = """\
@@ -128,6 +132,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def run(asked: argparse.Namespace) -> Fused:
     """Do what the command line asks for."""
     options = _options(asked)
+    if asked.view and asked.no_mosaic:
+        raise TeamError("--view shows the mosaic: leave out --no-mosaic")
     if asked.workers < 1:
         raise TeamError(f"--workers must be at least 1, got {asked.workers}")
     watch = Stopwatch()
@@ -142,26 +148,49 @@ def run(asked: argparse.Namespace) -> Fused:
     with watch.stage("writing"):
         write_pairs(out, fused)
         write_poses(out, fused)
+        write_attitudes(out, fused)
         write_graphs(out, fused)
         write_trajectories(out, fused)
         write_json(out / "drift.json", drift)
     notes: list[str] = []
     try:
-        if not asked.no_mosaic:
-            quiet = asked.quiet
-            mosaics = write_mosaics(out, fused, options.mosaic, asked.workers, watch, quiet=quiet)
-            with watch.stage("drawing"):
-                write_location_graphs(out, fused, mosaics)
-        if asked.overhead:
-            with watch.stage("overhead"):
-                write_overheads(out, fused, options.front_end.features.overhead)
+        _write_pictures(asked, out, fused, options, watch)
+        if asked.check:
+            with watch.stage("check"):
+                notes.append(_second_opinion(fused))
     finally:  # a picture that fails late doesn't cost the numbers
         table = closing_table(fused, drift, watch.seconds)
         table += "".join(f"{note}\n" for note in notes)
         write_atomic(out / "report.txt", table)
         print(table, end="")
     print(f"everything is in {out}")
+    if asked.view:
+        view_ply(out / "team.ply")
     return fused
+
+
+def _write_pictures(
+    asked: argparse.Namespace, out: Path, fused: Fused, options: RunOptions, watch: Stopwatch
+) -> None:
+    if not asked.no_mosaic:
+        quiet = asked.quiet
+        mosaics = write_mosaics(out, fused, options.mosaic, asked.workers, watch, quiet=quiet)
+        with watch.stage("drawing"):
+            write_location_graphs(out, fused, mosaics)
+            for component, mosaic in mosaics.items():
+                path = out / f"{component_name('team', component)}.ply"
+                write_ply(path, mosaic, fused.best, component)
+    if asked.overhead:
+        with watch.stage("overhead"):
+            write_overheads(out, fused, options.front_end.features.overhead)
+
+
+def _second_opinion(fused: Fused) -> str:
+    """Open3D's optimum of the largest component's Pose2 graph against ours."""
+    largest = [frame for frame, part in sorted(fused.team.component_of.items()) if part == 0]
+    if len(largest) < 2:
+        return "no check: the largest component has a single frame"
+    return check_with_open3d(largest, fused.edges, fused.team).line()
 
 
 def _options(asked: argparse.Namespace) -> RunOptions:

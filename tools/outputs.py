@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from groundfuse.backend import g2o
+from groundfuse.backend.bundle_estimate import BundleEstimate
 from groundfuse.backend.measurement import (
     EdgeVerdict,
     FrameId,
@@ -29,6 +30,10 @@ POSE = ("x_m", "y_m", "theta_deg", *SIGMAS)
 VERDICT = ("a", "b", "verdict", "reason", "value", "limit")
 GAMMA = ("rho_m", "phi1_deg", "phi2_deg")  # the paper's relative location, eq. 18
 PAIR_COLUMNS = (*VERDICT, *POSE, *GAMMA, "inliers", "ambiguity", "chi2")
+ATTITUDE_COLUMNS = (
+    *("robot", "index", "image", "tilt_deg", "tilt_sigma_deg", "roll_deg", "roll_sigma_deg"),
+    *("height_m", "height_sigma_m"),
+)
 POSE_COLUMNS = ("robot", "index", "image", "component", *POSE)
 
 
@@ -159,6 +164,22 @@ def write_poses(out: Path, fused: Fused) -> None:
         image = frames[frame][1].path.name
         rows.append([frame.robot, frame.index, image, best.component_of[frame], *where, *sigma])
     write_atomic(out / "poses.csv", csv_text(POSE_COLUMNS, rows))
+
+
+def write_attitudes(out: Path, fused: Fused) -> None:
+    """Write frames_estimated.csv: every frame's bundled tilt, roll and height with sigmas."""
+    if not isinstance(fused.bundled, BundleEstimate):
+        return
+    found, spread = fused.bundled.attitude, fused.bundled.attitude_sigma
+    rows = []
+    for frame, (_, known) in sorted(fused.frames.items()):
+        if frame in found:
+            here, sigma = found[frame], spread[frame]
+            angles = [here.tilt_rad, sigma.tilt_rad, here.roll_rad, sigma.roll_rad]
+            height = [here.height_m, sigma.height_m]
+            image = known.path.name
+            rows.append([frame.robot, frame.index, image, *map(math.degrees, angles), *height])
+    write_atomic(out / "frames_estimated.csv", csv_text(ATTITUDE_COLUMNS, rows))
 
 
 def write_json(path: Path, content: object) -> None:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
-from groundfuse.backend.measurement import FrameId
+from groundfuse.backend.measurement import FrameId, Rejected, RelativePose
 from groundfuse.frontend.arrays import Image
 from groundfuse.frontend.mosaic import Mosaic, MosaicOptions, MosaicView, build_mosaic
 from groundfuse.frontend.overhead_view import OverheadOptions, overhead_grid, overhead_view
@@ -69,7 +69,7 @@ def _views(fused: Fused, component: int) -> list[MosaicView]:
 def write_location_graphs(out: Path, fused: Fused, mosaics: Mapping[int, Mosaic]) -> None:
     """Write a picture of every component's trajectories and edges over its mosaic."""
     feet = {robot.name: robot.camera.mount.base_from_foot for robot in fused.robots}
-    edges = [*fused.edges, *fused.front_end.rejected]
+    edges: list[RelativePose | Rejected] = [*fused.edges, *fused.front_end.rejected]
     for component, mosaic in mosaics.items():
         picture = draw_location_graph(mosaic, fused.best, edges, component, feet)
         write_png(out / f"{component_name('location_graph', component)}.png", picture)
