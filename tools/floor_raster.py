@@ -23,7 +23,7 @@ Texture = Callable[[int, Rect], Image]
 
 
 class FloorRaster:
-    """A floor that can be read at any place and level.
+    """A floor that can be read at any place and level, by one thread at a time.
 
     Attributes:
         cell_m: size of a cell of level 0.
