@@ -282,8 +282,9 @@ def _within(gate: Gate, motions: Floats, floor_b: Points, tolerance_m: float) ->
     centre = np.median(floor_b, axis=0)
     size = np.sqrt(((floor_b - centre) ** 2).sum(axis=1).mean())
     far, turn = _apart(motions, _coefficients(gate.a_from_b), centre)
-    near: Mask = far <= gate.radius_m + turn * np.hypot(*centre) + tolerance_m
-    return near & (turn <= gate.turn_rad + tolerance_m / max(size, tolerance_m))
+    near = far <= gate.radius_m + turn * np.hypot(*centre) + tolerance_m
+    allowed: Mask = near & (turn <= gate.turn_rad + tolerance_m / max(size, tolerance_m))
+    return allowed
 
 
 def _distinct(
