@@ -231,5 +231,5 @@ def _lies(
         return planar.between(one[i], planar.compose(np.broadcast_to(shift, (len(j), 3)), two[j]))
     reach = 2.0 * shape.step_m
     distance, bearing = rng.uniform(0.0, reach, len(i)), rng.uniform(-np.pi, np.pi, len(i))
-    turn = rng.uniform(-np.pi, np.pi, len(i))
-    return np.stack([distance * np.cos(bearing), distance * np.sin(bearing), turn], axis=1)
+    turned = rng.uniform(-np.pi, np.pi, len(i))
+    return np.stack([distance * np.cos(bearing), distance * np.sin(bearing), turned], axis=1)
