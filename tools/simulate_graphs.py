@@ -230,6 +230,6 @@ def _lies(
         shift = np.array([length * np.cos(bearing), length * np.sin(bearing), turn])
         return planar.between(one[i], planar.compose(np.broadcast_to(shift, (len(j), 3)), two[j]))
     reach = 2.0 * shape.step_m
-    distance, bearing = rng.uniform(0.0, reach, len(i)), rng.uniform(-np.pi, np.pi, len(i))
+    distance, bearings = rng.uniform(0.0, reach, len(i)), rng.uniform(-np.pi, np.pi, len(i))
     turned = rng.uniform(-np.pi, np.pi, len(i))
-    return np.stack([distance * np.cos(bearing), distance * np.sin(bearing), turned], axis=1)
+    return np.stack([distance * np.cos(bearings), distance * np.sin(bearings), turned], axis=1)
