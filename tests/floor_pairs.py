@@ -123,7 +123,7 @@ def camera(
     base_from_foot=IDENTITY,
     focal_px=257.0,
     coefficients=(),
-    factor=1.0,
+    sigma=None,
     rows=(0, -1),
 ):
     """A camera of 320 x 240 pixels."""
@@ -131,7 +131,7 @@ def camera(
         320, 240, focal_px, 1.003 * focal_px, 158.9, 120.4, Distortion.PLUMB_BOB, coefficients
     )
     attitude = Attitude(math.radians(tilt_deg), math.radians(roll_deg), height_m)
-    return Camera(lens, Mount(attitude, wobble(height_m, factor), base_from_foot), *rows)
+    return Camera(lens, Mount(attitude, sigma or wobble(height_m), base_from_foot), *rows)
 
 
 def speckle(seed, rect):
@@ -157,12 +157,16 @@ def photo(
     light=Photometry(),  # noqa: B008
     *,
     still=False,
+    grain_m=None,
 ) -> RenderedFrame:
-    """A photograph by a wobbling camera; wobble and noise belong to the frame's name."""
+    """A photograph by a wobbling camera; wobble and noise belong to the frame's name.
+
+    The floor's grain suits cameras at `grain_m`, by default this one.
+    """
     rng = np.random.default_rng([11, ord(frame.robot[0]), frame.index])
     attitude = view_camera.mount.attitude if still else wobbled(view_camera, rng)
     view = TrueView(view_camera, attitude, pose)
-    image = take(world(floor, view_camera.mount.attitude.height_m), view, light, rng)
+    image = take(world(floor, grain_m or view_camera.mount.attitude.height_m), view, light, rng)
     return RenderedFrame(frame, image, view)
 
 
