@@ -173,7 +173,7 @@ def _print_meetings(scene: Scene) -> None:
         for b in names[k + 1 :]:
             pairs = meetings(views[a], views[b])
             places = count_places(pairs, (len(views[a]), len(views[b])))
-            print(f"{a} and {b}: {len(pairs)} pairs share 40 % or more, at {places} places")
+            print(f"{a} and {b}: {len(pairs)} pairs share 40 % or more; places: {places}")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
