@@ -35,7 +35,10 @@ def write_mosaics(
     """Build and write the mosaic of every component with its layers; return them by component."""
     mosaics: dict[int, Mosaic] = {}
     for component in sorted(set(fused.best.component_of.values())):
-        with watch.stage("mosaic"), tqdm(desc="mosaic    ", disable=quiet, leave=False) as bar:
+        with (
+            watch.stage("mosaic"),
+            tqdm(desc="mosaic    ", disable=quiet or None, leave=False) as bar,
+        ):
 
             def told(done: int, total: int, bar: tqdm = bar) -> None:
                 bar.total = total
