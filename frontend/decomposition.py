@@ -156,12 +156,12 @@ def _tilt(b_by_a: Matrix) -> float:
 def _step(b_by_a: Matrix, tilt_a: float, tilt_b: float, theta: float) -> Floats:
     """Camera b seen from camera a, axes of foot a, in heights of a (paper eq. 12-18).
 
-    t = (A - R) n weighs both of the paper's solutions by least squares and never divides.
+    t = (A - R) n weighs both of the paper's solutions by least squares and never divides. R takes
+    the plumb line n of camera a to that of camera b, whatever the heading.
     """
     c, s = math.cos(theta), math.sin(theta)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    axes_a, axes_b = foot_from_cam(tilt_a, 0.0), foot_from_cam(tilt_b, 0.0)
-    rotation = axes_b.T @ turn.T @ axes_a
-    normal = np.array([0.0, math.sin(tilt_a), math.cos(tilt_a)])
-    step: Floats = -turn @ axes_b @ ((b_by_a - rotation) @ normal)
+    plumb_a = np.array([0.0, math.sin(tilt_a), math.cos(tilt_a)])
+    plumb_b = np.array([0.0, math.sin(tilt_b), math.cos(tilt_b)])
+    step: Floats = -turn @ foot_from_cam(tilt_b, 0.0) @ (b_by_a @ plumb_a - plumb_b)
     return step
