@@ -38,7 +38,10 @@ MESSAGE_KEYS = {
     "d": "distortion_coefficients",
 }
 NEEDED = ("image_width", "image_height", "camera_matrix", "distortion_model", "mount")
-UNUSED = ("rectification_matrix", "projection_matrix", "R", "r", "P", "p", "header", "binning_x")
+UNUSED = (
+    *("rectification_matrix", "projection_matrix", "R", "r", "P", "p", "header", "binning_x"),
+    "estimated",  # what a bundle knew of the numbers
+)
 KNOWN = (*NEEDED, "distortion_coefficients", "camera_name", *UNUSED, "binning_y", "roi")
 MOUNT_NEEDED = ("height_m", "tilt_deg")
 MOUNT_OPTIONAL = (
