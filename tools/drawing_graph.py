@@ -21,7 +21,7 @@ from groundfuse.tools.drawing_style import (
 )
 
 NUM_SIGMAS = 3.0
-ELLIPSE_MARKERS = 3.0
+ELLIPSE_MARKERS = 5.0
 """The largest ellipse is drawn with a half axis of up to this many markers' radii."""
 LARGEST_MARKER_PX = 11.0
 SMALLEST_MARKER_PX = 3.0
@@ -98,9 +98,9 @@ def draw_edge(canvas: Canvas, ends: Floats, kind: EdgeKind, colour: Colour) -> N
     elif kind is EdgeKind.LOOP:
         canvas.line(ends, mixed(colour, WHITE, 0.35), 1.5, casing=mixed(colour, INK, 0.5))
     elif kind is EdgeKind.OVERLAP:
-        canvas.line(ends, OVERLAP, 1.5, casing=INK)
+        canvas.line(ends, OVERLAP, 1.0, casing=INK)
     else:
-        canvas.dashes(ends, REJECTED, 0.5, 5.0, 7.0, casing=WHITE)
+        canvas.dashes(ends, REJECTED, 1.0, 3.0, 6.0)
 
 
 def draw_marker(canvas: Canvas, centre: Floats, radius_px: float, colour: Colour) -> None:

@@ -123,6 +123,8 @@ def _draw_robot(pen: _Pen, graph: Graph, robot: str, frames: int) -> None:
 
 def _draw_edge_sample(pen: _Pen, kind: EdgeKind, words: str) -> None:
     ends = np.array([[pen.left_px, pen.y_px], [pen.left_px + SAMPLE_PX - 10.0, pen.y_px]])
+    if kind is EdgeKind.REJECTED:
+        pen.canvas.line(ends, FAINT, 9.0)  # floor enough to see its light dashes on
     draw_edge(pen.canvas, ends, kind, robot_colour(0))
     pen.say(words, indent_px=SAMPLE_PX)
 

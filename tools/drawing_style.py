@@ -12,7 +12,8 @@ GRID: Colour = (224, 226, 228)
 WHITE: Colour = (255, 255, 255)
 OVERLAP: Colour = (32, 214, 250)
 """Edges between robots: yellow, which no robot has."""
-REJECTED: Colour = (60, 60, 60)
+REJECTED: Colour = (250, 250, 250)
+"""Edges that were tried in vain: there may be many, so they are no more than a hint."""
 
 # Okabe and Ito's palette, which colour-blind people tell apart, without its yellow and black.
 ROBOTS: tuple[Colour, ...] = (
