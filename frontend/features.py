@@ -60,6 +60,11 @@ class FeatureOptions:
     sigma_image_px: float = 0.15
     cell_px: int = 48
 
+    def __post_init__(self) -> None:
+        """Refuse a kind that there is not (ValueError)."""
+        if self.kind not in {"sift", "orb"}:
+            raise ValueError(f"kind must be sift or orb, got {self.kind!r}")
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Features:

@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import math
+import os
 
 import gtsam
 import numpy as np
@@ -370,3 +371,13 @@ def test_an_out_folder_that_vanished_is_one_line(tmp_path, truth):
     ):
         with pytest.raises(DataError, match=r"cannot write: a file stands where a folder is need"):
             write(tmp_path / "file", fused)
+
+
+def test_files_of_an_earlier_run_are_found(tmp_path):
+    for name, age_s in (("team_1.g2o", 100.0), ("notes.txt", 50.0), ("team.g2o", 0.0)):
+        (tmp_path / name).write_text("x")
+        os.utime(tmp_path / name, (1000.0 - age_s, 1000.0 - age_s))
+    (tmp_path / "overhead").mkdir()
+    os.utime(tmp_path / "overhead", (1.0, 1.0))
+    assert outputs.files_before(tmp_path, 1000.0) == ["notes.txt", "team_1.g2o"]
+    assert outputs.files_before(tmp_path, 1.0) == []

@@ -5,6 +5,7 @@ import logging
 import math
 import os
 import sys
+import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -27,6 +28,7 @@ from groundfuse.tools.open3d_check import check_with_open3d
 from groundfuse.tools.outputs import (
     check_names,
     component_name,
+    files_before,
     write_attitudes,
     write_graphs,
     write_json,
@@ -49,6 +51,7 @@ from groundfuse.tools.settings import record, with_settings
 from groundfuse.tools.team_folder import list_robots, read_team
 from groundfuse.tools.view3d import view_ply, write_ply
 
+log = logging.getLogger(__name__)
 SAMPLE = Path(__file__).resolve().parent.parent / "data" / "team"
 EPILOG = """\
 examples:
@@ -136,7 +139,7 @@ def run(asked: argparse.Namespace) -> Fused:
         raise TeamError("--view shows the mosaic: leave out --no-mosaic")
     if asked.workers < 1:
         raise TeamError(f"--workers must be at least 1, got {asked.workers}")
-    watch = Stopwatch()
+    watch, begin_s = Stopwatch(), time.time()
     with watch.stage("reading"):
         robots = read_team(asked.team, asked.robots or list_robots(asked.team))
         check_names(robot.name for robot in robots)
@@ -164,6 +167,9 @@ def run(asked: argparse.Namespace) -> Fused:
         write_atomic(out / "report.txt", table)
         print(table, end="")
     print(f"everything is in {out}")
+    others = files_before(out, begin_s)
+    if others:
+        log.warning("%s: not of this run: %s", out, ", ".join(others))
     if asked.view:
         view_ply(out / "team.ply")
     return fused
@@ -201,7 +207,12 @@ def _options(asked: argparse.Namespace) -> RunOptions:
         if not 0.0 < asked.cell < math.inf:
             raise TeamError(f"--cell must be positive, got {asked.cell:g}")
         options = replace(options, mosaic=replace(options.mosaic, m_per_px=asked.cell))
-    return with_settings(options, asked.set)
+    options = with_settings(options, asked.set)
+    if options.front_end.matcher is not chosen.matcher:
+        raise TeamError(
+            "--set front_end.matcher: more goes with a matcher than its name, use --matcher"
+        )
+    return options
 
 
 class _Bar:

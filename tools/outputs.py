@@ -49,6 +49,12 @@ def check_names(robots: Iterable[str]) -> None:
                 )
 
 
+def files_before(out: Path, begin_s: float) -> list[str]:
+    """Return the files that were there already and have not been written since a time."""
+    files = (path for path in out.iterdir() if path.is_file())
+    return sorted(path.name for path in files if path.stat().st_mtime < begin_s)
+
+
 def csv_text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     """Return CSV text with every digit of every number."""
     stream = io.StringIO()
