@@ -4,7 +4,7 @@ import gtsam
 import numpy as np
 
 from groundfuse.backend import planar
-from groundfuse.backend.problem import Array, Indices, Problem
+from groundfuse.backend.problem import Array, Indices, Metric, Problem
 
 PRIOR_SIGMA = 1e-6  # m and rad; the prior only fixes the frame, its residual is 0 at the optimum
 MAX_STEPS = 10
@@ -15,7 +15,12 @@ def factor_graph(problem: Problem, held: Indices, poses: Array) -> gtsam.Nonline
     """Return BetweenFactorPose2 for every edge and one PriorFactorPose2 per held pose.
 
     Keys are the numbers of the poses.
+
+    Raises:
+        ValueError: the problem is not in gtsam's metric.
     """
+    if problem.metric != Metric.LOG:
+        raise ValueError(f"gtsam's factors have gtsam's metric, got {problem.metric}")
     graph = gtsam.NonlinearFactorGraph()
     information = np.ascontiguousarray(problem.information)
     rows = zip(problem.a.tolist(), problem.b.tolist(), problem.a_from_b.tolist(), strict=True)

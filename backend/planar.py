@@ -99,6 +99,13 @@ def by_right(tangent: Array) -> Array:
     return matrix
 
 
+def turn(pose: Array) -> Array:
+    """Return (n, 3, 3) the derivative of (x, y, theta) of pose exp(d) by d at 0."""
+    matrix = adjoint(pose)
+    matrix[..., :2, 2] = 0.0
+    return matrix
+
+
 def carried(by: Array, covariance: Array) -> Array:
     """Return by covariance by' for stacks of 3x3."""
     moved: Array = by @ covariance @ np.swapaxes(by, -1, -2)

@@ -1,11 +1,13 @@
 """A planar pose graph as arrays: residuals, derivatives, cost, connected parts; numpy and scipy.
 
-The residual of an edge is log(a_from_b^-1 (pose_a^-1 pose_b)), gtsam's BetweenFactorPose2; chi2 is
-the sum of residual' information residual (twice gtsam's `error`).
+The error of an edge is the motion a_from_b^-1 (pose_a^-1 pose_b). Its residual is the logarithm of
+that, as in gtsam's BetweenFactorPose2, or its plain x, y, theta, as in g2o's EDGE_SE2; chi2 is the
+sum of residual' information residual (twice gtsam's `error`, g2o's chi2).
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -18,6 +20,13 @@ from groundfuse.backend.measurement import FrameId, RelativePose
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
+
+
+class Metric(StrEnum):
+    """What the residual of an edge is: the logarithm of its error, or its x, y and theta."""
+
+    LOG = "gtsam"
+    PLAIN = "g2o"
 
 
 class Linear(NamedTuple):
@@ -38,6 +47,7 @@ class Problem:
         b: (m,) measured pose of each edge.
         a_from_b: (m, 3) measured x m, y m, theta rad.
         information: (m, 3, 3) inverse covariances, order x y theta.
+        metric: what the residual of an edge is.
     """
 
     num_poses: int
@@ -45,6 +55,7 @@ class Problem:
     b: Indices
     a_from_b: Array
     information: Array
+    metric: Metric = Metric.LOG
 
     def __len__(self) -> int:
         return len(self.a)
@@ -79,7 +90,12 @@ def from_edges(index_of: Mapping[FrameId, int], edges: Sequence[RelativePose]) -
 def residuals(problem: Problem, poses: Array) -> Array:
     """Return (m, 3) residuals at poses (n, 3)."""
     predicted = planar.between(poses[problem.a], poses[problem.b])
-    return planar.log(planar.between(problem.a_from_b, predicted))
+    return _residual(problem, predicted)
+
+
+def _residual(problem: Problem, predicted: Array) -> Array:
+    error = planar.between(problem.a_from_b, predicted)
+    return planar.log(error) if problem.metric == Metric.LOG else error
 
 
 def chi2_per_edge(problem: Problem, poses: Array) -> Array:
@@ -97,8 +113,8 @@ def chi2(problem: Problem, poses: Array) -> float:
 def linearised(problem: Problem, poses: Array) -> Linear:
     """Return residuals and derivatives at poses (n, 3)."""
     predicted = planar.between(poses[problem.a], poses[problem.b])
-    residual = planar.log(planar.between(problem.a_from_b, predicted))
-    by_b = planar.by_right(residual)
+    residual = _residual(problem, predicted)
+    by_b = planar.by_right(residual) if problem.metric == Metric.LOG else planar.turn(residual)
     return Linear(residual, -by_b @ planar.adjoint(planar.inverse(predicted)), by_b)
 
 

@@ -64,16 +64,27 @@ def settle(
         believed: (m,) edges that count at the start; all others start at nothing.
         options: limits.
     """
-    poses, accepted = start, trusted | believed
+    wanted = trusted | believed
+    poses = minimise(problem.of(wanted), start, _on(layout, problem, wanted)).poses
+    best, lowest = Robust(poses, trusted), np.inf
     for _ in range(options.max_passes):
-        before = accepted
-        poses = minimise(problem.of(accepted), poses, _on(layout, problem, accepted)).poses
-        candidates = ~trusted & (accepted | plausible(problem, poses, accepted, options.limit))
-        poses = _graduated(problem, poses, layout, trusted, candidates, options=options)
-        poses, accepted = _final(problem, poses, layout, trusted, options)
-        if np.array_equal(accepted, before):
+        candidates = wanted | plausible(problem, poses, wanted, options.limit)
+        if lowest < np.inf:  # later passes start from everything that is plausible by then
+            poses = minimise(problem.of(candidates), poses, _on(layout, problem, candidates)).poses
+        poses = _graduated(problem, poses, layout, trusted, candidates & ~trusted, options=options)
+        found = _final(problem, poses, layout, trusted, options)
+        cost = truncated(problem, found, options.limit)
+        if cost >= lowest:
             break
-    return Robust(poses, accepted)
+        best, lowest = found, cost
+        poses, wanted = found
+    return best
+
+
+def truncated(problem: Problem, found: Robust, limit: float) -> float:
+    """Return the truncated cost: chi2 of accepted edges, and the limit for each one turned down."""
+    error = chi2_per_edge(problem, found.poses)
+    return float(np.where(found.accepted, error, limit).sum())
 
 
 def plausible(problem: Problem, poses: Array, believed: Flags, limit: float) -> Flags:

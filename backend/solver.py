@@ -12,8 +12,8 @@ import numpy as np
 from scipy.sparse import csc_array
 
 from groundfuse.backend import planar, sparse
-from groundfuse.backend.initial import layout_of
-from groundfuse.backend.problem import Array, Problem, chi2, linearised
+from groundfuse.backend.initial import chordal, layout_of
+from groundfuse.backend.problem import Array, Problem, chi2, components, linearised
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,6 +50,23 @@ class Solution(NamedTuple):
     chi2: float
     iterations: int
     converged: bool
+
+
+def optimum(
+    problem: Problem, start: Array | None = None, options: SolverOptions = DEFAULTS
+) -> Solution:
+    """Return the best minimum found from the chordal start, or from `start` (n, 3) if better.
+
+    A start above the minimum that the chordal start leads to is of no use and costs no time. The
+    first pose of every connected part ends at the origin.
+    """
+    layout = layout_of(problem)
+    best = minimise(problem, chordal(problem, layout), layout, options)
+    if start is None or chi2(problem, start) >= best.chi2:
+        return best
+    part = components(problem)
+    _, first = np.unique(part, return_index=True)
+    return minimise(problem, planar.between(start[first[part]], start), layout, options)
 
 
 class Step(NamedTuple):

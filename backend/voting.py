@@ -4,8 +4,8 @@ An assignment joins the maps by one hypothesis per join; every other overlap the
 does not. Its score counts closures (pairs of maps that agree beyond what a tree needs; closing by
 chance is rare however many overlaps repeat the same mistake) far above support, and support only by
 its logarithm, so that only a clear majority decides between two maps that nobody else sees. Rivals
-whose support is within `ambiguity_ratio` of the best one's stay open: only what all of them agree on
-is used.
+whose support is within `ambiguity_ratio` of the best one's stay open, and only what all of them
+agree on is used.
 """
 
 import math

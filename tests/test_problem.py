@@ -1,5 +1,7 @@
 """Residuals, derivatives and cost of the arrays against gtsam's factors."""
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -24,9 +26,11 @@ def test_chi2_is_twice_the_error_of_gtsams_factors(seed):
     assert problem.chi2(graph, poses) == pytest.approx(expected, rel=RELATIVE)
 
 
-def test_derivatives_are_numeric_derivatives():
+@pytest.mark.parametrize("metric", list(problem.Metric))
+def test_derivatives_are_numeric_derivatives(metric):
     rng = np.random.default_rng(5)
     graph, truth = random_problem(rng, 6, 6)
+    graph = replace(graph, metric=metric)
     poses = planar.compose(truth, planar.exp(rng.normal(0.0, 0.3, truth.shape)))
     linear = problem.linearised(graph, poses)
     assert np.array_equal(linear.residual, problem.residuals(graph, poses))
@@ -77,3 +81,19 @@ def test_gtsam_reads_our_covariance_order():
     )
     expected = 2.0 * factor.error(native.values(poses))
     assert problem.chi2(graph, poses) == pytest.approx(expected, rel=RELATIVE)
+
+
+def test_g2o_takes_the_plain_components():
+    a, b = FrameId("A", 0), FrameId("A", 1)
+    graph = problem.from_edges({a: 0, b: 1}, [edge(a, b, Se2(1.0, 2.0, 0.3), sigma=1.0)])
+    poses = np.array([[0.0, 0.0, 0.0], [1.5, 2.5, 0.4]])
+    error = Se2(1.0, 2.0, 0.3).inverse() @ Se2(1.5, 2.5, 0.4)
+    plain = replace(graph, metric=problem.Metric.PLAIN)
+    assert problem.chi2(plain, poses) == pytest.approx(error.vector() @ error.vector())
+
+
+def test_gtsams_factors_are_not_made_of_g2os_metric():
+    graph, truth = random_problem(np.random.default_rng(1), 5, 0)
+    plain = replace(graph, metric=problem.Metric.PLAIN)
+    with pytest.raises(ValueError, match="gtsam's factors have gtsam's metric, got g2o"):
+        native.factor_graph(plain, np.empty(0, dtype=np.int64), truth)
