@@ -18,7 +18,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import cv2
 from tqdm import tqdm
 
+from groundfuse.backend.bundle_estimate import BundleEstimate
 from groundfuse.frontend.mosaic import MosaicOptions
+from groundfuse.tools.calibration_file import write_calibrations
 from groundfuse.tools.closing_table import closing_table
 from groundfuse.tools.drift_table import drift_record
 from groundfuse.tools.errors import TeamError
@@ -152,6 +154,8 @@ def run(asked: argparse.Namespace) -> Fused:
         write_pairs(out, fused)
         write_poses(out, fused)
         write_attitudes(out, fused)
+        if isinstance(fused.bundled, BundleEstimate):
+            write_calibrations(out, fused.robots, fused.bundled)
         write_graphs(out, fused)
         write_trajectories(out, fused)
         write_json(out / "drift.json", drift)
