@@ -6,10 +6,10 @@ import math
 import os
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 # Threads work on frames and pairs; a second layer of them inside numpy would only get in the way.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -150,15 +150,7 @@ def run(asked: argparse.Namespace) -> Fused:
     bar = _Bar(asked.quiet)
     fused = fuse_robots(robots, options, asked.workers, bar, watch, bundled=not asked.no_bundle)
     drift = drift_record(fused)
-    with watch.stage("writing"):
-        write_pairs(out, fused)
-        write_poses(out, fused)
-        write_attitudes(out, fused)
-        if isinstance(fused.bundled, BundleEstimate):
-            write_calibrations(out, fused.robots, fused.bundled)
-        write_graphs(out, fused)
-        write_trajectories(out, fused)
-        write_json(out / "drift.json", drift)
+    _write_numbers(out, fused, drift, watch)
     notes: list[str] = []
     try:
         _write_pictures(asked, out, fused, options, watch)
@@ -177,6 +169,18 @@ def run(asked: argparse.Namespace) -> Fused:
     if asked.view:
         view_ply(out / "team.ply")
     return fused
+
+
+def _write_numbers(out: Path, fused: Fused, drift: Mapping[str, Any], watch: Stopwatch) -> None:
+    with watch.stage("writing"):
+        write_pairs(out, fused)
+        write_poses(out, fused)
+        write_attitudes(out, fused)
+        if isinstance(fused.bundled, BundleEstimate):
+            write_calibrations(out, fused.robots, fused.bundled)
+        write_graphs(out, fused)
+        write_trajectories(out, fused)
+        write_json(out / "drift.json", drift)
 
 
 def _write_pictures(
