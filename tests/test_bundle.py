@@ -104,7 +104,7 @@ class TestTruth:
 
     def test_single_links_count_shared_noise_twice(self):
         # Eight views of one place share most keypoints: pairwise, their noise counts as new.
-        path = lawn_path(2, 4, 0.05, row_step=0.05)
+        path = lawn_path(2, 4, 0.05, 0.05)
         ratio = []
         for seed in range(3):
             team = world(50 + seed, (Robot("A", path),), min_common=20)
@@ -117,7 +117,7 @@ class TestTruth:
 
     def test_a_drone_with_coarse_priors(self):
         wobble = Attitude(math.radians(8.0), math.radians(8.0), 6.0)
-        drone = Robot("A", lawn_path(4, 6, 25.0, row_step=30.0), tilt_deg=0.0, height_m=60.0)
+        drone = Robot("A", lawn_path(4, 6, 25.0, 30.0), tilt_deg=0.0, height_m=60.0)
         drone = dataclasses.replace(drone, base_from_foot=Se2(0.0, 0.0, 0.0))
         team = simulate(
             (drone,),
