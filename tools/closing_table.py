@@ -41,6 +41,13 @@ def _drift_lines(drift: Mapping[str, Any]) -> list[str]:
         lines.append(f"{name} path {path:.2f} m, chain in {_count(pieces, 'piece')}")
     lines += _row("team ATE", drift["team"], "against_truth", "ate_m", "ate_percent")
     lines += _row("between robots", drift["team"], "between_robots", "rms_m", None)
+    pairs = drift.get("pairs")
+    if pairs is not None:
+        share = f"{pairs['num_right']} of {pairs['num_pairs']}"
+        middle = (
+            f"{_length(pairs['median_error_m'])}, {math.degrees(pairs['median_error_rad']):.3f} deg"
+        )
+        lines.append(f"accepted pairs right against truth {share}, median error {middle}")
     return lines
 
 

@@ -11,6 +11,7 @@ from groundfuse.backend.drift import (
     path_length_m,
 )
 from groundfuse.backend.measurement import FrameId, Se2, TeamEstimate
+from groundfuse.tools.pair_scores import pair_scores
 from groundfuse.tools.pipeline import Fused, accepted_edges
 
 
@@ -31,7 +32,13 @@ def drift_record(fused: Fused) -> dict[str, Any]:
     team = {
         stage: _team_row(_largest(estimate), truth) for stage, estimate in _estimates(fused).items()
     }
-    return {"robots": robots, "team": team, "has_ground_truth": bool(truth)}
+    heights = {frame: known.attitude.height_m for frame, (_, known) in fused.frames.items()}
+    return {
+        "robots": robots,
+        "team": team,
+        "pairs": pair_scores(fused.front_end.edges, truth, heights),
+        "has_ground_truth": bool(truth),
+    }
 
 
 def _estimates(fused: Fused) -> dict[str, TeamEstimate]:
