@@ -15,6 +15,7 @@ from groundfuse.frontend.overhead import floor_from_rays
 LATTICE_COLUMNS = 33
 LATTICE_ROWS = 49
 OUTWARDS = 1.2
+OUTWARD_STEPS = 241
 BEYOND = 1.5
 """A lattice point past the limit still counts for the extent when its neighbour is within it and
 it is at most this many times too coarse: the limit itself lies between the two."""
@@ -74,11 +75,12 @@ def widest_ray(camera: Camera) -> float:
         return math.inf
     rays, _, _ = _lattice(camera)
     length = np.nan_to_num(np.hypot(rays[:, 0], rays[:, 1]))
-    corner = rays[np.argmax(length)]
-    outwards = camera.intrinsics.px_from_rays(np.linspace(1.0, OUTWARDS, 41)[:, None] * corner)
-    steps = np.diff(outwards, axis=0) @ (outwards[0] - camera.intrinsics.px_from_rays(0 * rays)[0])
-    growing = int(np.argmin(np.append(steps, -np.inf) > 0.0))
-    return float(length.max() * (1.0 + (OUTWARDS - 1.0) * growing / 40.0))
+    shares = np.linspace(0.0, OUTWARDS, OUTWARD_STEPS)
+    ray = rays[np.argmax(length)]
+    px = camera.intrinsics.px_from_rays(shares[:, None] * ray)
+    steps = np.diff(np.hypot(*(px - px[0]).T))
+    growing = int(np.argmin(np.append(steps, -np.inf) > 0.0))  # the first step that does not
+    return float(length.max() * shares[growing])
 
 
 def footprint(camera: Camera, attitude: Attitude, team_from_foot: Se2) -> Footprint:

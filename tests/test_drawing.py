@@ -183,8 +183,12 @@ def test_only_the_component_is_drawn():
 def test_covariance_is_turned_to_the_axes_of_the_map():
     estimate, edges = small_team()
     graph = graph_of(estimate, edges, 0, {})
-    # B0 heads along y: its forward deviation of 2 mm lies along y, its side's of 1 mm along x.
-    np.testing.assert_allclose(graph.covariance[FrameId("B", 0)], np.diag([1e-6, 4e-6]), atol=1e-18)
+    # Forward 2 mm, sideways 1 mm: forward is along the heading.
+    for frame in (FrameId("B", 0), FrameId("B", 1)):
+        heading = estimate.team_from_base[frame].theta_rad
+        ahead = np.array([math.cos(heading), math.sin(heading)])
+        expected = 1e-6 * np.eye(2) + 3e-6 * np.outer(ahead, ahead)
+        np.testing.assert_allclose(graph.covariance[frame], expected, atol=1e-18)
 
 
 def test_ellipse_is_as_large_as_its_covariance():

@@ -5,6 +5,7 @@ from analytic_floor import centres, make_camera, ring, rounded, view_of, waves
 
 from groundfuse.backend.measurement import FrameId, Se2
 from groundfuse.frontend.gains import (
+    Exposure,
     Samples,
     estimate_exposure,
     neutral_exposure,
@@ -68,6 +69,13 @@ def test_views_that_share_nothing_stay_as_they_are():
     assert (found.log_gain == 0.0).all()
     assert (found.falloff == 0.0).all()
     assert found.noise_levels == neutral_exposure(2).noise_levels
+
+
+def test_factor_is_the_sum_of_gain_and_powers_of_the_radius():
+    exposure = Exposure(np.array([[0.1, 0.2, 0.3]]), np.array([[0.5, -0.25, 2.0]]), 3.0)
+    found = exposure.log_factor(0, np.array([0.0, 2.0]))
+    fall = 0.5 * 2 - 0.25 * 4 + 2.0 * 8
+    np.testing.assert_allclose(found, [[0.1, 0.2, 0.3], [0.1 + fall, 0.2 + fall, 0.3 + fall]])
 
 
 def test_radius_is_one_half_diagonal_from_the_principal_point():

@@ -98,3 +98,12 @@ def test_spread_of_the_half_widens_the_limit():
     alive = np.array([[False, True, True, True, False]]).T
     assert agreeing_views(colours, alive, 1.0, 3.0).all()
     assert agreeing_views(colours, alive, 1.0, 0.5)[:, 0].tolist() == alive[:, 0].tolist()
+
+
+def test_limit_allows_for_the_noise_of_the_mean_itself():
+    # Two survivors: their mean has half a view's variance, so sigma is sqrt(1.5) of the noise.
+    limit = 3.0 * 4.0 * np.sqrt(1.5)
+    colours = np.zeros((4, 3, 2), np.float32)
+    colours[3] = [limit * 0.999, limit * 1.001]
+    alive = np.array([[True] * 2, [True] * 2, [False] * 2, [False] * 2])
+    assert agreeing_views(colours, alive, 4.0, 3.0)[3].tolist() == [True, False]
