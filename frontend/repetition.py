@@ -8,7 +8,7 @@ import math
 
 import cv2
 import numpy as np
-from scipy.signal import fftconvolve
+from scipy import fft
 
 from groundfuse.frontend.arrays import Mask, Picture32
 
@@ -19,6 +19,15 @@ MIN_OVERLAP = 0.3
 MAIN_LOBE_SHARE = 0.06
 FAINTEST = 0.05
 """Standard deviation below which a view holds no floor but rounding: a blank picture."""
+
+
+def _convolved(one: Picture32, two: Picture32) -> Picture32:
+    """Return all of the convolution; scipy.signal does the same but takes seconds to import."""
+    size = [m + n - 1 for m, n in zip(one.shape, two.shape, strict=True)]
+    fast = [fft.next_fast_len(side, real=True) for side in size]
+    product = fft.irfft2(fft.rfft2(one, fast) * fft.rfft2(two, fast), fast)
+    whole: Picture32 = product[: size[0], : size[1]]
+    return whole
 
 
 def repetition(normalised: Picture32, mask: Mask) -> float:
@@ -36,10 +45,10 @@ def repetition(normalised: Picture32, mask: Mask) -> float:
     # A neighbourhood average removes noise that no repetition could survive.
     value = cv2.resize(normalised, size, interpolation=cv2.INTER_AREA) * (weight > 0.99)
     weight = (weight > 0.99).astype(np.float32)
-    product = fftconvolve(value, value[::-1, ::-1])
-    power = fftconvolve(value * value, weight[::-1, ::-1])
+    product = _convolved(value, value[::-1, ::-1])
+    power = _convolved(value * value, weight[::-1, ::-1])
     norm = np.sqrt(np.maximum(power * power[::-1, ::-1], 0.0))
-    overlap = fftconvolve(weight, weight[::-1, ::-1])
+    overlap = _convolved(weight, weight[::-1, ::-1])
     rows, columns = product.shape
     away = np.hypot(
         *np.ogrid[-(rows // 2) : rows - rows // 2, -(columns // 2) : columns - columns // 2]

@@ -57,13 +57,13 @@ log = logging.getLogger(__name__)
 SAMPLE = Path(__file__).resolve().parent.parent / "data" / "team"
 EPILOG = """\
 examples:
-  fuse_team.py --robots A B                          the sample team that ships with the project
-  fuse_team.py --team my_team --out my_map           all robots of a folder
-  fuse_team.py --robots A --matcher paper            one robot, the paper's matcher
+  fuse_team.py --robots A B                    the sample team of the project
+  fuse_team.py --team my_team --out my_map     all robots of a folder
+  fuse_team.py --robots A --matcher paper      one robot, the paper's matcher
   fuse_team.py --robots A B --set front_end.motion.max_ambiguity=0.5
 
-a team folder holds a folder per robot: images/, camera.yaml and, if you have them,
-frames.csv (times, attitudes, odometry) and groundtruth.tum (for scoring only).
+a team folder holds a folder per robot: images/, camera.yaml and, if you have
+them, frames.csv (times, attitudes, odometry) and groundtruth.tum (for scoring).
 """
 
 
