@@ -18,6 +18,7 @@ from groundfuse.tools.drawing_graph import (
     ELLIPSE_MARKERS,
     NUM_SIGMAS,
     Placing,
+    draw_cone,
     draw_ellipse,
     exaggeration,
     marker_px,
@@ -201,6 +202,15 @@ def test_ellipse_is_as_large_as_its_covariance():
     across = drawn @ np.array([math.cos(angle), math.sin(angle)])
     assert along.max() == pytest.approx(60.0, abs=3.0)
     assert across.max() == pytest.approx(20.0, abs=3.0)
+
+
+@pytest.mark.parametrize(("heading_rad", "way"), [(0.0, (1, 0)), (math.pi / 2, (0, -1))])
+def test_cone_opens_along_the_heading(heading_rad, way):
+    canvas = Canvas(100, 100, WHITE)
+    draw_cone(canvas, np.array([50.0, 50.0]), heading_rad, 30.0, (0, 0, 0))
+    ahead = centroid(canvas.finished(), WHITE) - 50.0
+    # The centre of a sector's area lies at about two thirds of its radius.
+    assert np.abs(ahead - 20.0 * np.array(way)).max() < 3.0
 
 
 @pytest.mark.parametrize("sigma_m", [1e-5, 1e-3, 0.5])
