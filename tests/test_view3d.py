@@ -12,6 +12,7 @@ from map_world import circle, edge, small_mosaic, small_team
 
 from groundfuse.backend.measurement import EdgeVerdict, FrameId, Se2, TeamEstimate
 from groundfuse.tools import open3d_import, view3d
+from groundfuse.tools.drawing_style import robot_colour
 from groundfuse.tools.errors import DataError, TeamError
 from groundfuse.tools.map_points import floor_points, map_points
 from groundfuse.tools.open3d_check import Differences, chained, check_with_open3d
@@ -115,7 +116,10 @@ def test_trajectories_float_over_the_floor_in_their_colours():
     floating = found.points[found.points[:, 2] > 0.0][:, :2]
     middle = (np.array(expected[0]) + expected[1]) / 2
     assert np.hypot(*(floating - middle).T).min() < 0.01  # the ribbon fills the way between
-    assert len(np.unique(found.edge_colours, axis=0)) == 2
+    blue, green, red = robot_colour(0)
+    assert (found.edge_colours[:5] == [red, green, blue]).all()
+    assert (found.colours[found.edges[:5, 0]] == [red, green, blue]).all()
+    assert (found.edge_colours[5:] == robot_colour(1)[::-1]).all()
 
 
 def test_a_single_frame_has_no_lines():
@@ -198,12 +202,13 @@ def test_a_wrong_estimate_is_told_and_the_worst_frame_named(open3d):
     assert open3d
     frames, edges, estimate = noisy_graph(4)
     moved = estimate.team_from_base | {
-        frames[5]: estimate.team_from_base[frames[5]] @ Se2(0.01, 0, 0)
+        frames[5]: estimate.team_from_base[frames[5]] @ Se2(0.01, 0, 0.02)
     }
     wrong = TeamEstimate(moved, estimate.component_of, {}, (), (), 0.0, 0)
     found = check_with_open3d(frames, edges, wrong)
     assert found.worst == frames[5]
     assert found.max_m == pytest.approx(0.01, abs=TOLERANCE_M)
+    assert found.max_rad == pytest.approx(0.02, abs=TOLERANCE_RAD)
 
 
 def test_edges_that_were_turned_down_take_no_part(open3d):
@@ -330,7 +335,8 @@ WITHOUT_OPEN3D = textwrap.dedent("""
             names.append(module.name)
     from map_world import small_mosaic, small_team
     from groundfuse.tools.drawing import draw_location_graph
-    from groundfuse.tools.errors import TeamError
+    from groundfuse.tools.drawing_style import robot_colour
+from groundfuse.tools.errors import TeamError
     from groundfuse.tools.open3d_check import check_with_open3d
     from groundfuse.tools.view3d import write_ply
     estimate, edges = small_team()
