@@ -14,7 +14,6 @@ from scipy.spatial import KDTree
 
 from groundfuse.frontend.arrays import Floats, Matrix, Points
 
-SMALLEST_WEIGHT = 1e-3
 NEIGHBOURHOOD = 0.08
 """No part of a picture is farther from its corners than this, in focal lengths."""
 
@@ -61,8 +60,8 @@ def transferred(b_from_a: Matrix, rays_a: Points) -> Points:
     return rays_b
 
 
-def fitted_homography(rays_a: Points, rays_b: Points, weights: Floats) -> Matrix:
-    """Return the homography from a to b by weighted normalised DLT (Hartley 1997).
+def fitted_homography(rays_a: Points, rays_b: Points) -> Matrix:
+    """Return the homography from a to b by normalised DLT (Hartley 1997).
 
     Raises:
         ValueError: fewer than four points.
@@ -74,8 +73,8 @@ def fitted_homography(rays_a: Points, rays_b: Points, weights: Floats) -> Matrix
     b = rays_b @ scale_b[:2, :2].T + scale_b[:2, 2]
     from_a = np.column_stack([a, np.ones(len(a))])
     none = np.zeros_like(from_a)
-    rows_u = np.hstack([from_a, none, -b[:, :1] * from_a]) * weights[:, None]
-    rows_v = np.hstack([none, from_a, -b[:, 1:] * from_a]) * weights[:, None]
+    rows_u = np.hstack([from_a, none, -b[:, :1] * from_a])
+    rows_v = np.hstack([none, from_a, -b[:, 1:] * from_a])
     rows = np.vstack([rows_u, rows_v])
     _, vectors = np.linalg.eigh(rows.T @ rows)
     homography: Matrix = np.linalg.inv(scale_b) @ vectors[:, 0].reshape(3, 3) @ scale_a
@@ -145,9 +144,7 @@ def refined_homography(
         if len(found.index_a) < options.min_matches:
             return found
         rays_a, rays_b = rays[0][found.index_a], rays[1][found.index_b]
-        off = np.linalg.norm(transferred(homography, rays_a) - rays_b, axis=1)
-        weights = 1.0 / (1.0 + (off / (window / 4.0)) ** 2)  # Cauchy
-        homography = fitted_homography(rays_a, rays_b, np.maximum(weights, SMALLEST_WEIGHT))
+        homography = fitted_homography(rays_a, rays_b)
     return guided_matches(homography, rays, invariants, last, options)
 
 

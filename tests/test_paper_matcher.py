@@ -9,6 +9,7 @@ import pytest
 from flat_world import SIDE_PX, painted_floor, photograph
 
 from groundfuse.backend.measurement import IDENTITY, Attitude, Reason, Se2
+from groundfuse.frontend import paper_matcher
 from groundfuse.frontend.camera import Camera, Distortion, Intrinsics, Mount
 from groundfuse.frontend.decomposition import floor_homography
 from groundfuse.frontend.matches import Matches, Miss
@@ -16,6 +17,7 @@ from groundfuse.frontend.overhead import floor_from_rays, rays_from_floor
 from groundfuse.frontend.overhead_view import OverheadOptions
 from groundfuse.frontend.paper_matcher import PaperOptions, ambiguity, detect, match
 from groundfuse.frontend.refine import Guided, transferred
+from groundfuse.frontend.segments import voted
 
 SIGMA = Attitude(math.radians(0.5), math.radians(0.15), 0.002)
 DISTORTED = (-0.12, 0.03, 5e-4, -5e-4, 0.0)
@@ -114,6 +116,28 @@ def test_views_without_common_floor_are_a_miss():
     assert isinstance(got, Miss)
     assert got.reason in {Reason.FEW_CANDIDATES, Reason.FEW_INLIERS}
     assert got.value < got.limit
+
+
+def test_too_few_corners_that_agree_are_a_miss():
+    a, b = seen(CAMERA_A, IDENTITY), seen(CAMERA_B, IDENTITY, floor=painted_floor(101))
+    got = match(a, b, replace(PaperOptions(), min_segments=1), np.random.default_rng(0))
+    assert isinstance(got, Miss)
+    assert (got.reason, got.limit) == (
+        Reason.FEW_INLIERS,
+        max(24.0, math.ceil(0.08 * min(len(a), len(b)))),
+    )
+    assert got.value < got.limit
+
+
+def test_the_motion_with_most_corners_wins_whatever_its_segments(monkeypatch):
+    motion = Se2(0.1, 0.05, 0.4)
+    a, b = seen(CAMERA_A, IDENTITY), seen(CAMERA_B, motion)
+
+    def worst_first(*args):
+        return [vote._replace(num_segments=9) for vote in voted(*args)[::-1]]
+
+    monkeypatch.setattr(paper_matcher, "voted", worst_first)
+    check_start(match(a, b, rng=np.random.default_rng(0)), motion)
 
 
 def test_an_even_floor_is_a_miss():

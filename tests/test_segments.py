@@ -183,6 +183,30 @@ def test_fewer_points_than_candidates(count):
     assert (got.num_ranks, len(got.a), len(got.b)) == (count, 5 * count, 5 * count)
 
 
+def test_every_rank_is_drawn_and_near_ones_more_often():
+    pair = scene(100, 0)
+    wrong = np.random.default_rng(5).permutation(np.repeat(np.arange(100), 3)).reshape(100, 3)
+    options = SegmentOptions(num_draws=60_000, max_segments=60_000)
+    counts = []
+    for rank in (0, 2):
+        index_b = wrong.copy()
+        index_b[:, rank] = np.arange(100)
+        candidates = Candidates(np.repeat(np.arange(100), 3), index_b.ravel(), 3)
+        ranked = pair._replace(candidates=candidates)
+        segments = matched_segments(ranked, options, np.random.default_rng(0))
+        assert off(voted(ranked, segments, options)[0].a_from_b, MOTION)[0] < 0.003
+        right = candidates.a[segments] == candidates.b[segments]
+        counts.append(right.all(axis=1).sum())
+    # Ranks are drawn as 1 : 1/2 : 1/3, and both ends must be right: nine to one.
+    assert counts[0] / counts[1] == pytest.approx(9.0, rel=0.15)
+
+
+def test_no_more_segments_vote_than_allowed():
+    options = SegmentOptions(num_draws=60_000, max_segments=70)
+    segments = matched_segments(scene(200, 0), options, np.random.default_rng(0))
+    assert segments.shape == (70, 2)
+
+
 def test_nothing_matched_is_no_vote():
     pair = scene(0, 50)
     strict = SegmentOptions(num_draws=1000, min_correlation=1.1)
