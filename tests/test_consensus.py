@@ -55,7 +55,8 @@ def modes(found, *, scales=0.0, options=OPTIONS, gate=None, seed=0):
 
 
 # 40 voters with 1.5 mm of noise each: 0.3 mm and 1 mrad, if no wrong candidate votes by chance; one
-# at the edge of 10 mm takes 0.25 mm and 2 mrad more. Worst seen, with 2 mm of noise: 2.4 mm at foot b, 0.0032 rad.
+# at the edge of 10 mm takes 0.25 mm and 2 mrad more. Worst seen, with 2 mm of noise: 2.4 mm at
+# foot b, 0.0032 rad.
 NEAR_M, NEAR_RAD = 0.005, 0.012
 
 

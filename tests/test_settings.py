@@ -147,8 +147,10 @@ def test_option_names_are_in_the_records_order():
         ("=1", "--set : no option '', known are inner, number, size"),
         (
             "inner=1",
-            "--set inner: names a group of options "
-            "(share, number, on, word, colour, widths, cell_m)",
+            (
+                "--set inner: names a group of options "
+                "(share, number, on, word, colour, widths, cell_m)"
+            ),
         ),
         ("size.of=1", "--set size.of: 'size' is an option, not a group"),
         ("inner.number=1.5", "--set inner.number: got '1.5', needed a whole number"),
