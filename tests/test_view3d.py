@@ -5,6 +5,7 @@ import subprocess
 import sys
 import textwrap
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -326,7 +327,7 @@ WITHOUT_OPEN3D = textwrap.dedent("""
                 asked.append(name)
                 raise ModuleNotFoundError("blocked", name="open3d")
     sys.meta_path.insert(0, Blocked())
-    sys.path.insert(0, "tests")
+    sys.path.insert(0, sys.argv[2])
     import groundfuse.backend, groundfuse.frontend, groundfuse.tools
     names = []
     for package in (groundfuse.backend, groundfuse.frontend, groundfuse.tools):
@@ -335,8 +336,7 @@ WITHOUT_OPEN3D = textwrap.dedent("""
             names.append(module.name)
     from map_world import small_mosaic, small_team
     from groundfuse.tools.drawing import draw_location_graph
-    from groundfuse.tools.drawing_style import robot_colour
-from groundfuse.tools.errors import TeamError
+    from groundfuse.tools.errors import TeamError
     from groundfuse.tools.open3d_check import check_with_open3d
     from groundfuse.tools.view3d import write_ply
     estimate, edges = small_team()
@@ -352,7 +352,7 @@ from groundfuse.tools.errors import TeamError
 
 def test_everything_else_works_without_open3d(tmp_path):
     path = tmp_path / "team.ply"
-    command = [sys.executable, "-c", WITHOUT_OPEN3D, str(path)]
+    command = [sys.executable, "-c", WITHOUT_OPEN3D, str(path), str(Path(__file__).parent)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     count, _, rest = done.stdout.strip().partition(" ")
