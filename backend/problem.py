@@ -1,8 +1,9 @@
 """A planar pose graph as arrays: residuals, derivatives, cost, connected parts; numpy and scipy.
 
 The error of an edge is the motion a_from_b^-1 (pose_a^-1 pose_b). Its residual is the logarithm of
-that, as in gtsam's BetweenFactorPose2, or its plain x, y, theta, as in g2o's EDGE_SE2; chi2 is the
-sum of residual' information residual (twice gtsam's `error`, g2o's chi2).
+that, as in gtsam's BetweenFactorPose2, or its plain x, y, theta, as in g2o's EDGE_SE2, or x, y and
+the chord 2 sin(theta / 2), as in SE-Sync; chi2 is the sum of residual' information residual (twice
+gtsam's `error`, g2o's chi2, twice SE-Sync's objective).
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,10 +24,11 @@ Indices = NDArray[np.int64]
 
 
 class Metric(StrEnum):
-    """What the residual of an edge is: the logarithm of its error, or its x, y and theta."""
+    """What the residual of an edge is: its error's logarithm, x y theta, or x y chord."""
 
     LOG = "gtsam"
     PLAIN = "g2o"
+    CHORD = "se-sync"
 
 
 class Linear(NamedTuple):
@@ -95,7 +97,28 @@ def residuals(problem: Problem, poses: Array) -> Array:
 
 def _residual(problem: Problem, predicted: Array) -> Array:
     error = planar.between(problem.a_from_b, predicted)
-    return planar.log(error) if problem.metric == Metric.LOG else error
+    match problem.metric:
+        case Metric.LOG:
+            return planar.log(error)
+        case Metric.PLAIN:
+            return error
+        case Metric.CHORD:
+            error[:, 2] = 2.0 * np.sin(error[:, 2] / 2.0)
+            return error
+
+
+def _by_b(problem: Problem, residual: Array) -> Array:
+    """Return the derivative of the residual by a right perturbation of pose b."""
+    match problem.metric:
+        case Metric.LOG:
+            return planar.by_right(residual)
+        case Metric.PLAIN:
+            return planar.turn(residual)
+        case Metric.CHORD:
+            half = np.arcsin(np.clip(residual[:, 2] / 2.0, -1.0, 1.0))
+            by_b = planar.turn(np.column_stack([residual[:, :2], 2.0 * half]))
+            by_b[:, 2, 2] = np.cos(half)
+            return by_b
 
 
 def chi2_per_edge(problem: Problem, poses: Array) -> Array:
@@ -114,7 +137,7 @@ def linearised(problem: Problem, poses: Array) -> Linear:
     """Return residuals and derivatives at poses (n, 3)."""
     predicted = planar.between(poses[problem.a], poses[problem.b])
     residual = _residual(problem, predicted)
-    by_b = planar.by_right(residual) if problem.metric == Metric.LOG else planar.turn(residual)
+    by_b = _by_b(problem, residual)
     return Linear(residual, -by_b @ planar.adjoint(planar.inverse(predicted)), by_b)
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
+from scipy.sparse import coo_array, csc_array, diags_array
 from scipy.sparse.linalg import SuperLU, splu
 
 Array = NDArray[np.float64]
@@ -69,7 +69,7 @@ def pattern(num_nodes: int, a: Indices, b: Indices, held: Indices) -> Pattern:
 
 def assembled(
     layout: Pattern, aa: Array, ab: Array, bb: Array, extra: Array | None = None
-) -> sparse.csc_array:
+) -> csc_array:
     """Sum blocks (m, k, k) of all edges into a symmetric matrix of the free nodes.
 
     Args:
@@ -93,10 +93,15 @@ def assembled(
         columns.append(np.broadcast_to((k * column[kept])[:, None, None] + inner, shape).ravel())
         values.append(block[kept].ravel())
     entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-    return sparse.csc_array(sparse.coo_array(entries, shape=(k * layout.size,) * 2))
+    return csc_array(coo_array(entries, shape=(k * layout.size,) * 2))
 
 
-def factorised(matrix: sparse.csc_array) -> SuperLU:
+def diagonal(values: Array) -> csc_array:
+    """Return a diagonal matrix."""
+    return csc_array(diags_array(values))
+
+
+def factorised(matrix: csc_array) -> SuperLU:
     """Factorise a symmetric matrix in its given order (RuntimeError where it is singular)."""
     return splu(
         matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
