@@ -201,7 +201,8 @@ def compare(a: Seen, b: Seen, options: FrontEndOptions) -> RelativePose | Reject
     if a.paper is not None and b.paper is not None:
         found = paper_matcher.match(a.paper, b.paper, options.paper, rng)
     else:
-        found = sift_matcher.match(a.features, b.features, options.match, rng, gate)
+        swayed = None if gate is None else _swayed(gate, a, b, options)
+        found = sift_matcher.match(a.features, b.features, options.match, rng, swayed)
     result = relative_pose(_view(a), _view(b), found, options.motion)
     if isinstance(result, RelativePose) and gate is not None:
         off_m, off_rad = _off(_foot_motion(a, b, result.a_from_b), gate)
@@ -240,6 +241,21 @@ def _odometry_gate(a: Seen, b: Seen, options: FrontEndOptions) -> Gate | None:
     turn_rad, radius_m = math.sqrt(turn2), math.sqrt(place2)
     gate = options.odometry_gate_sigmas
     return Gate(_foot_motion(a, b, motion), gate * radius_m, gate * turn_rad)
+
+
+def _swayed(gate: Gate, a: Seen, b: Seen, options: FrontEndOptions) -> Gate:
+    """Widen a gate by how far the wobble moves the floor in the middle of the views.
+
+    Matching takes the cameras at their expected attitudes; only the fit knows better.
+    """
+    sway2 = 0.0
+    for seen in (a, b):
+        expected, sigma = seen.frame.attitude, seen.frame.sigma
+        by_tilt = expected.height_m / math.cos(expected.tilt_rad) ** 2 * sigma.tilt_rad
+        by_height = math.tan(expected.tilt_rad) * sigma.height_m
+        sway2 += by_tilt**2 + (expected.height_m * sigma.roll_rad) ** 2 + by_height**2
+    sway_m = options.odometry_gate_sigmas * math.sqrt(sway2)
+    return gate._replace(radius_m=math.hypot(gate.radius_m, sway_m))
 
 
 def _foot_motion(a: Seen, b: Seen, a_from_b: Se2) -> Se2:
