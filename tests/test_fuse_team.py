@@ -289,12 +289,12 @@ def test_accepted_pairs_are_right_and_know_how_sure_they_are(sample, sample_trut
         sigma = [float(row["sigma_x_m"]), float(row["sigma_y_m"])]
         squares.append((error[:2] / sigma) ** 2)
     assert sum(wide) >= 0.97 * len(wide) > 20
-    # 1 where sigmas are true; seen 1.0 (x) and 0.9 (y) over 78 pairs that share frames.
+    # 1 where sigmas are true; seen 0.85 (x) and 1.06 (y) over 78 pairs that share frames.
     assert 0.4 < np.mean(squares) < 2.0
 
 
 def test_poses_know_how_sure_they_are(sample, sample_truth):
-    """Position errors over sigmas: 1 where they are true. The scale is not in them."""
+    """Position errors over sigmas: 1 where they are true; seen 0.34, as frames share errors."""
     rows = {FrameId(r["robot"], int(r["index"])): r for r in sample.rows("poses.csv")}
     first = FrameId("A", 0)
     assert rows[first]["sigma_x_m"] == ""
@@ -396,55 +396,45 @@ def test_without_bundle_and_pictures_there_are_numbers(tmp_path):
     assert set(ran.json("drift.json")["team"]) == {"optimised"}
 
 
-def test_overhead_views_of_every_frame(tmp_path):
-    ran = run(painted_pair(), tmp_path / "out", *NUMBERS_ONLY, "--robots", "B", "--overhead")
+def test_overhead_views_of_every_frame_and_files_of_an_earlier_run(tmp_path, caplog):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "team_1.g2o").write_text("VERTEX_SE2 0 0 0 0\n")
+    os.utime(out / "team_1.g2o", (1.0, 1.0))
+    with caplog.at_level(logging.WARNING):
+        ran = run(painted_pair(), out, *NUMBERS_ONLY, "--robots", "B", "--overhead")
     assert ran.code == 0
+    assert caplog.messages == [f"{out}: not of this run: team_1.g2o"]
     assert {p.name for p in (ran.out / "overhead").iterdir()} == {f"B{k}.png" for k in range(3)}
-
-
-def test_the_cell_that_was_asked_for(pair, tmp_path):
-    ran = run(painted_pair(), tmp_path / "out", "--cell", "0.02", settings=QUICK[:2])
-    assert ran.code == 0
-    assert float((ran.out / "mosaic.pgw").read_text().split()[0]) == 0.02
-    assert ran.json("options.json")["mosaic"]["m_per_px"] == 0.02
-    coarse, fine = (cv2.imread(str(r.out / "mosaic.png")).shape[0] for r in (ran, pair))
-    assert abs(2 * coarse - fine) <= 4
 
 
 @pytest.mark.parametrize("matcher", ["fast", "paper"])
 def test_the_other_matchers_give_a_map(tmp_path, matcher):
     members = {"A": Member(arc(2)), "B": Member(arc(1, Se2(0.3, 0.1, 0.4)))}
     team = paint_team(tmp_path / "team", members)
-    settings = [s for s in QUICK if "overhead" not in s]
-    ran = run(team, tmp_path / "out", "--matcher", matcher, settings=settings)
+    ran = run(team, tmp_path / "out", "--matcher", matcher, settings=QUICK[2:])
     assert ran.code == 0
     assert "team in 1 component" in ran.report
     assert ran.json("options.json")["front_end"]["matcher"] == matcher
     poses, edges = graph_of(ran, "team")
     assert len(poses) == len(edges) == 3
-    # Coarse correspondences of three views; worst seen 3.4 mm (fast).
+    # Three small views at full resolution; worst over seeds 1 to 5 4.0 mm (fast), 0.9 mm (paper).
     assert misplaced_m(poses, painted_truth(members)) < 0.012
-
-
-def test_files_of_an_earlier_run_are_pointed_out(tmp_path, caplog):
-    out = tmp_path / "out"
-    out.mkdir()
-    (out / "team_1.g2o").write_text("VERTEX_SE2 0 0 0 0\n")
-    os.utime(out / "team_1.g2o", (1.0, 1.0))
-    with caplog.at_level(logging.WARNING):
-        assert run(painted_pair(), out, *NUMBERS_ONLY, "--robots", "A").code == 0
-    assert caplog.messages == [f"{out}: not of this run: team_1.g2o"]
 
 
 # Shapes of teams
 
 
 def test_a_robot_alone(tmp_path):
-    ran = run(painted_pair(), tmp_path / "out", "--robots", "A/")
+    """With a cell of its own choice, too, twice as large as that of `QUICK`."""
+    more = ("--robots", "A/", "--cell", "0.02")
+    ran = run(painted_pair(), tmp_path / "out", *more, settings=QUICK[:2])
     assert ran.code == 0
     names = {p.name for p in ran.out.iterdir()}
     assert not [name for name in names if name.startswith("B")]
-    assert (ran.out / "mosaic.png").exists()
+    assert float((ran.out / "mosaic.pgw").read_text().split()[0]) == 0.02
+    assert ran.json("options.json")["mosaic"]["m_per_px"] == 0.02
+    assert cv2.imread(str(ran.out / "mosaic.png")).shape[0] < 100
     assert set(graph_of(ran, "team")[0]) == {FrameId("A", k) for k in range(4)}
     assert graph_of(ran, "team")[0].keys() == graph_of(ran, "A")[0].keys()
 
