@@ -19,7 +19,9 @@ BARREL = (-0.1, 0.02, 0.001, -0.0005, 0.0)
 def grid_over(camera, cell_m):
     box = footprint(camera, ATTITUDE, POSE).bounds(0.02)
     rows, columns = (np.ceil((box[1] - box[0]) / cell_m).astype(int)[::-1] + 1).tolist()
-    return Grid(float(box[0][0]), float(box[1][1]), cell_m, rows, columns)
+    whole = Grid(float(box[0][0]), float(box[1][1]), cell_m, rows, columns)
+    middle = [slice(max(0, side // 2 - 150), side // 2 + 150) for side in (rows, columns)]
+    return whole.part(*middle)
 
 
 def exact_px(camera, points):
@@ -60,9 +62,9 @@ def test_what_folds_back_into_the_picture_is_not_seen():
     limit = widest_ray(folding)
     # r - 0.2 r^3 turns back at r = 1.29 and is 0 again at 2.24; the corner's ray is 0.95 long.
     assert 0.95 < limit < 1.29
-    grid = Grid(-2.0, 2.0, 0.01, 400, 400)
+    grid = Grid(-2.0, 2.0, 0.02, 200, 200)
     found = sight(folding, Attitude(0.0, 0.0, 0.55), Se2(0, 0, 0), grid, 1e9)
-    radius_m = np.hypot(*grid.centres().T).reshape(400, 400)
+    radius_m = np.hypot(*grid.centres().T).reshape(200, 200)
     assert found.seen.any()
     assert radius_m[found.seen].max() < limit * 0.55
     assert widest_ray(make_camera()) == np.inf
