@@ -229,7 +229,7 @@ def test_light_refines_the_motion(monkeypatch):
         None,
         found_by_light(Se2(0.05, 0.0, 0.0)),
         found_by_light(Se2(0.0, 0.0, 0.05)),
-        found_by_light(IDENTITY, residual=0.81),
+        found_by_light(IDENTITY, residual=1.81),
     ],
     ids=["nothing", "far", "turned", "unlike"],
 )
