@@ -91,7 +91,7 @@ def fused_of(robots, edges, turned=(), repetition=0.1, bundled=None):
     return Fused(robots, front_end, every, alone, fuse(frames, every), bundled)
 
 
-def bundle_of(team, *, poses=None, rejected=(), attitude=None, findings=()):
+def bundle_of(team, *, poses=None, rejected=(), attitude=None, sigma=None, findings=()):
     """A bundle that moved the team to `poses` and turned pairs down."""
     from dataclasses import replace
 
@@ -99,7 +99,7 @@ def bundle_of(team, *, poses=None, rejected=(), attitude=None, findings=()):
     return BundleEstimate(
         team=moved,
         attitude=attitude or {},
-        attitude_sigma={},
+        attitude_sigma=sigma or {},
         mounts=(),
         scale_sigma=0.007,
         residual_px=0.123,

@@ -89,6 +89,19 @@ def test_the_drift_lines_are_the_record(truth):
     assert line_of(text, "A path") == f"A path {path:.2f} m, chain in 1 piece"
 
 
+def test_right_pairs_are_counted_where_the_truth_is_known(truth):
+    fused = fused_of(robots_of([*A, *B], truth), met(truth))
+    pairs = drift_record(fused)["pairs"]
+    line = line_of(table_of(fused), "accepted pairs right")
+    form = (
+        r"accepted pairs right against truth (\d+) of (\d+), median error ([\d.]+) mm, ([\d.]+) deg"
+    )
+    right, count, error_mm, error_deg = map(float, re.fullmatch(form, line).groups())
+    assert (right, count) == (pairs["num_right"], pairs["num_pairs"])
+    assert error_mm == pytest.approx(1e3 * pairs["median_error_m"], abs=0.0051)
+    assert error_deg == pytest.approx(math.degrees(pairs["median_error_rad"]), abs=0.00051)
+
+
 def test_without_truth_and_bundle_there_is_nothing_to_say_of_them(truth):
     text = table_of(fused_of(robots_of([*A, *B]), met(truth)))
     for word in ("truth", "team ATE", "between robots ", "bundle:"):

@@ -98,6 +98,17 @@ def test_the_bundle_is_a_stage_where_there_is_one(truth):
     assert list(before["team"]) == ["optimised"]
 
 
+def test_accepted_pairs_are_scored_by_the_camera_height(truth):
+    """Right within 30 mm at 0.55 m: the last two err by 25 and 35 mm."""
+    edges = [*chain(truth, A), *chain(truth, B), *overlaps(truth)]
+    shifts = {A[4]: Se2(0.0, 0.025, 0.0), A[5]: Se2(0.0, 0.035, 0.0)}
+    off = [edge(truth, A[0], b, shift, sigma=30.0) for b, shift in shifts.items()]
+    pairs = drift_record(fused_of(robots_of([*A, *B], truth), [*edges, *off]))["pairs"]
+    assert (pairs["num_pairs"], pairs["num_right"]) == (len(edges) + 2, len(edges) + 1)
+    assert pairs["median_error_m"] < EXACT
+    assert drift_record(fused_of(robots_of([*A, *B]), edges))["pairs"] is None
+
+
 def test_nothing_is_claimed_without_ground_truth(truth):
     record = drift_record(fused_of(robots_of([*A, *B]), slipped(truth)))
     assert record["has_ground_truth"] is False

@@ -40,10 +40,11 @@ CHAINED_PERCENT = 0.2  # promised for 13 views; seen 0.051
 # Two ways to one number through files of full precision; worst seen 2e-15 m.
 EXACT = 1e-9
 PICTURES = ("mosaic", "mosaic_mean", "mosaic_count", "mosaic_few")
-ROBOT = ("{}.g2o", "{}.ids.json", "{}.tum", "{}_chained.tum", "{}_groundtruth.tum")
+TRAJECTORIES = ("{}.tum", "{}_chained.tum", "{}_groundtruth.tum")
+ROBOT = ("{}.g2o", "{}.ids.json", "{}_calibration.yaml", *TRAJECTORIES)
 TEAM = ("team.g2o", "team.ids.json", "pairs.csv", "poses.csv", "drift.json", "options.json")
 PROMISED = {
-    *TEAM, "report.txt", "location_graph.png", "team.ply",
+    *TEAM, "report.txt", "frames_estimated.csv", "location_graph.png", "team.ply",
     *(f"{stem}.{kind}" for stem in PICTURES for kind in ("png", "pgw")),
     *(form.format(name) for form in ROBOT for name in ("A", "B")),
 }  # fmt: skip

@@ -27,7 +27,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from groundfuse.backend import g2o
-from groundfuse.backend.measurement import FrameId, Reason, Se2
+from groundfuse.backend.measurement import Attitude, FrameId, Reason, Se2
 from groundfuse.backend.trajectory import parsed_tum
 from groundfuse.tools import outputs
 from groundfuse.tools.errors import DataError, TeamError
@@ -153,6 +153,13 @@ def test_every_tried_pair_stands_once_with_its_numbers(tmp_path, truth):
         sigma = [float(row[name]) for name in outputs.SIGMAS]
         assert sigma == pytest.approx([SIGMA_M, 1.5 * SIGMA_M, math.degrees(SIGMA_RAD)])
         assert (row["inliers"], row["ambiguity"]) == ("50", "0.25")
+        # The paper's Gamma: b seen from a at distance and bearing, a seen from b (eq. 18).
+        rho_m, phi1, phi2 = (float(row[name]) for name in outputs.GAMMA)
+        back = e.a_from_b.inverse()
+        for bearing, seen in ((phi1, e.a_from_b), (phi2, back)):
+            turn = math.radians(bearing)
+            ends = [rho_m * math.cos(turn), rho_m * math.sin(turn)]
+            assert ends == pytest.approx([seen.x_m, seen.y_m], abs=EXACT)
         assert 0.0 <= float(row["chi2"]) < EXACT
     few = by_pair["A0", "B3"]
     assert (few["verdict"], few["reason"]) == ("rejected", "few_inliers")
@@ -344,6 +351,25 @@ def test_poses_stand_with_their_sigmas(tmp_path, truth):
         sigma = [float(row[name]) for name in outputs.SIGMAS]
         assert sigma[:2] == pytest.approx(np.sqrt(variance[:2]))
         assert math.radians(sigma[2]) == pytest.approx(math.sqrt(variance[2]))
+
+
+def test_estimated_attitudes_stand_in_degrees_and_metres(tmp_path, truth):
+    robots, edges = robots_of([*A, *B]), met(truth)
+    plain = fused_of(robots, edges)
+    outputs.write_attitudes(tmp_path, plain)
+    assert not list(tmp_path.iterdir())  # nothing was estimated
+    attitude = {f: Attitude(0.5 + 0.01 * f.index, -0.02, 0.56) for f in [*A, *B]}
+    sigma = {f: Attitude(0.001, 0.002, 0.003) for f in [*A, *B]}
+    bundled = bundle_of(plain.team, attitude=attitude, sigma=sigma)
+    outputs.write_attitudes(tmp_path, fused_of(robots, edges, bundled=bundled))
+    rows = rows_of(tmp_path / "frames_estimated.csv")
+    assert tuple(rows[0]) == outputs.ATTITUDE_COLUMNS
+    assert [(r["robot"], int(r["index"])) for r in rows] == [(f.robot, f.index) for f in [*A, *B]]
+    row = rows[2]
+    assert row["image"] == "img_02.png"
+    degrees = [float(row[n]) for n in ("tilt_deg", "tilt_sigma_deg", "roll_deg", "roll_sigma_deg")]
+    assert np.radians(degrees) == pytest.approx([0.52, 0.001, -0.02, 0.002])
+    assert (float(row["height_m"]), float(row["height_sigma_m"])) == (0.56, 0.003)
 
 
 def test_poses_and_graph_are_the_bundles_where_there_is_one(tmp_path, truth):
