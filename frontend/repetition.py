@@ -8,7 +8,6 @@ import math
 
 import cv2
 import numpy as np
-from scipy import fft
 
 from groundfuse.frontend.arrays import Mask, Picture32
 
@@ -24,10 +23,9 @@ FAINTEST = 0.05
 def _convolved(one: Picture32, two: Picture32) -> Picture32:
     """Return all of the convolution; scipy.signal does the same but takes seconds to import."""
     size = [m + n - 1 for m, n in zip(one.shape, two.shape, strict=True)]
-    fast = [fft.next_fast_len(side, real=True) for side in size]
-    product = fft.irfft2(fft.rfft2(one, fast) * fft.rfft2(two, fast), fast)
-    whole: Picture32 = product[: size[0], : size[1]]
-    return whole
+    fast = [cv2.getOptimalDFTSize(side) for side in size]
+    product = np.fft.irfft2(np.fft.rfft2(one, fast) * np.fft.rfft2(two, fast), fast)
+    return np.asarray(product[: size[0], : size[1]], dtype=np.float32)
 
 
 def repetition(normalised: Picture32, mask: Mask) -> float:
@@ -41,10 +39,11 @@ def repetition(normalised: Picture32, mask: Mask) -> float:
     """
     shrink = max(1.0, max(normalised.shape) / WORKING_PX)
     size = tuple(max(8, math.ceil(side / shrink)) for side in normalised.shape[::-1])
-    weight = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    share = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.99
+    weight = np.asarray(share, dtype=np.float32)
     # A neighbourhood average removes noise that no repetition could survive.
-    value = cv2.resize(normalised, size, interpolation=cv2.INTER_AREA) * (weight > 0.99)
-    weight = (weight > 0.99).astype(np.float32)
+    shrunk = cv2.resize(normalised, size, interpolation=cv2.INTER_AREA)
+    value = np.asarray(np.asarray(shrunk) * weight, dtype=np.float32)
     product = _convolved(value, value[::-1, ::-1])
     power = _convolved(value * value, weight[::-1, ::-1])
     norm = np.sqrt(np.maximum(power * power[::-1, ::-1], 0.0))
