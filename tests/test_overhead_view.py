@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from groundfuse.backend.measurement import Attitude
-from groundfuse.frontend.area_remap import area_remap, singular_values
 from groundfuse.frontend.camera import Camera, Distortion, Intrinsics, Mount
 from groundfuse.frontend.overhead import floor_from_rays, rays_from_floor
 from groundfuse.frontend.overhead_view import (
@@ -213,19 +212,6 @@ def test_the_cell_follows_the_height_of_the_mount():
     assert raster_cell_m(camera, OverheadOptions(m_per_px=0.1)) == 0.1
     coarse = Intrinsics(64, 48, 50.0, 50.0, 31.5, 23.5)
     assert raster_cell_m(camera_of(coarse, ATTITUDES["33"]), OverheadOptions()) == 0.55 / 50.0
-
-
-def test_jacobians_have_the_singular_values_of_numpy():
-    jacobians = np.random.default_rng(1).normal(size=(50, 2, 2))
-    expected = np.linalg.svd(jacobians, compute_uv=False)
-    got = singular_values(jacobians[:, :, 0], jacobians[:, :, 1])
-    np.testing.assert_allclose(np.stack(got, axis=1), expected, atol=1e-12)
-
-
-def test_a_tile_without_wanted_cells_is_no_error():
-    source = np.full((6, 6, 2), np.nan)
-    got = area_remap([np.zeros((9, 9), np.uint8)], source, np.zeros((4, 4), bool))
-    assert got.shape == (4, 4)
 
 
 def test_no_resolved_floor_is_refused():
