@@ -5,7 +5,8 @@ in the positions and the headings as complex numbers of length 1. Its Lagrangian
 semidefinite program whose solution is known at a stationary point: the multipliers follow from
 stationarity, and if the matrix of the quadratic form less the multipliers has no negative
 eigenvalue, the point is a global minimum. That is checked by the signs of one sparse factorisation.
-Carlone et al., "Planar pose graph optimization: duality, optimal solutions, and verification", 2016.
+Carlone et al., "Planar pose graph optimization: duality, optimal solutions, and verification",
+2016.
 
 Whatever the covariances are, every edge costs at least what an isotropic edge would whose
 information its own dominates, so the proven minimum of that problem bounds ours from below. Where
