@@ -196,6 +196,21 @@ def test_the_bundle_finds_the_attitudes_that_were_drawn(painted):
             )
 
 
+def test_odometry_comes_after_the_pictures_edges():
+    """The writer of pairs.csv takes the verdicts in this order."""
+    robots = read_team(painted_pair(), ["A"])
+    poses = dict(zip(robots[0].frames, PAIR["A"].poses, strict=True))
+    frames = [replace(f, odometry=odometry(p)) for f, p in list(poses.items())[:2]]
+    options = with_settings(RunOptions(), QUICK)
+    robot = replace(robots[0], frames=tuple(frames))
+    fused = fuse_robots([robot], options, 1, silent, Stopwatch(), bundled=False)
+    (seen,) = fused.front_end.edges
+    assert fused.edges[0] is seen
+    assert seen.correspondences is not None
+    assert [e.correspondences for e in fused.edges[1:]] == [None]
+    assert [(v.a, v.b, v.accepted) for v in fused.team.verdicts] == [(A[0], A[1], True)] * 2
+
+
 def test_no_bundle_where_none_is_wanted_or_none_is_possible():
     options = with_settings(RunOptions(), QUICK)
     robots = read_team(painted_pair(), ["A"])
