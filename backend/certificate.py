@@ -5,8 +5,7 @@ in the positions and the headings as complex numbers of length 1. Its Lagrangian
 semidefinite program whose solution is known at a stationary point: the multipliers follow from
 stationarity, and if the matrix of the quadratic form less the multipliers has no negative
 eigenvalue, the point is a global minimum. That is checked by the signs of one sparse factorisation.
-Carlone et al., "Planar pose graph optimization: duality, optimal solutions, and verification",
-2016.
+Carlone et al., "Planar pose graph optimization: duality, optimal solutions and verification", 2016.
 
 Whatever the covariances are, every edge costs at least what an isotropic edge would whose
 information its own dominates, so the proven minimum of that problem bounds ours from below. Where
@@ -186,7 +185,7 @@ def _less_multipliers(isotropic: Problem, multipliers: Array) -> csc_array:
     own[held_poses(isotropic), 0, 0] = along.mean()
     nobody = np.empty(0, dtype=np.int64)
     layout = sparse.pattern(isotropic.num_poses, isotropic.a, isotropic.b, nobody)
-    return sparse.assembled(layout, aa, ab, bb, own)
+    return sparse.assembled(sparse.filling(layout, 2, own=True), aa, ab, bb, own)
 
 
 def _least_shift(matrix: csc_array, fine: float) -> float:

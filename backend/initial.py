@@ -39,7 +39,9 @@ def _rotations(problem: Problem, layout: sparse.Pattern, weight: Array) -> Array
     """Minimise the sum of weight |u_b - u_a exp(i theta)|^2; held poses are u = 1."""
     turn = np.exp(1j * problem.a_from_b[:, 2])
     diagonal = weight[:, None, None].astype(complex)
-    matrix = sparse.assembled(layout, diagonal, (-weight * turn.conj())[:, None, None], diagonal)
+    matrix = sparse.assembled(
+        sparse.filling(layout, 1), diagonal, (-weight * turn.conj())[:, None, None], diagonal
+    )
     a_held = layout.rank[problem.a] < 0
     b_held = layout.rank[problem.b] < 0
     right = sparse.gathered(
@@ -64,7 +66,7 @@ def _translations(
     weight = axes @ planar.inverted(covariance) @ np.swapaxes(axes, 1, 2)
     step = planar.rotated(problem.a_from_b[:, :2], theta_rad[problem.a])
     push = (weight @ step[:, :, None])[:, :, 0]
-    matrix = sparse.assembled(layout, weight, -weight, weight)
+    matrix = sparse.assembled(sparse.filling(layout, 2), weight, -weight, weight)
     right = sparse.gathered(layout, -push, push)
     solved = sparse.factorised(matrix).solve(right.ravel()).reshape(-1, 2)
     return sparse.spread(layout, solved)

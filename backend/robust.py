@@ -119,11 +119,12 @@ def _graduated(
     error = chi2_per_edge(problem, poses)
     worst = float(error[candidates].max(initial=0.0))
     control = options.limit / max(worst - options.limit, 1e-9 * options.limit)
+    fill = sparse.filling(layout, 3)
     for _ in range(options.max_rounds):
         weights = np.where(candidates, _weights(error, control, options.limit), trusted * 1.0)
         if np.all((weights < 1e-3) | (weights > 1.0 - 1e-3)):
             break
-        step = gauss_newton_step(problem.weighted(weights), poses, layout, RIDGE)
+        step = gauss_newton_step(problem.weighted(weights), poses, layout, RIDGE, fill)
         poses = planar.compose(poses, planar.exp(step.tangent))
         error = chi2_per_edge(problem, poses)
         control *= options.growth
@@ -148,7 +149,7 @@ def _on(layout: sparse.Pattern, problem: Problem, chosen: Flags) -> sparse.Patte
     """Return the pattern of the chosen edges; a new one where they leave a part without gauge."""
     some = problem.of(chosen)
     if components(some).max(initial=0) + 1 == problem.num_poses - layout.size:
-        return sparse.Pattern(layout.size, layout.rank, some.a, some.b)
+        return layout.of(some.a, some.b)
     return layout_of(some)
 
 

@@ -27,12 +27,12 @@ class SolverOptions:
     """
 
     max_iterations: int = 100
-    relative_decrease: float = 1e-10
+    relative_decrease: float = 1e-8
     patience: int = 3
 
 
 DEFAULTS = SolverOptions()
-MAX_DAMPING = 1e8
+NO_DAMPING, FIRST_DAMPING, MAX_DAMPING = 1e-5, 1e-4, 1e8
 NOTHING = 1e-18  # chi2 of exact data
 
 
@@ -84,42 +84,44 @@ def minimise(
 ) -> Solution:
     """Return the local minimum below `start` (n, 3); the held poses of the layout stay."""
     layout = layout_of(problem) if layout is None else layout
+    fill = sparse.filling(layout, 3)
     best, best_chi2 = start, chi2(problem, start)
-    here, damping, waited = best, 0.0, 0
-    for iteration in range(options.max_iterations):
-        step = gauss_newton_step(problem, here, layout, damping)
-        if step.promised <= options.relative_decrease * best_chi2 + NOTHING and here is best:
-            return _last(problem, best, best_chi2, step, iteration + 1)
+    here, damping, waited, gain = best, 0.0, 0, 0.0
+    for iteration in range(1, options.max_iterations + 1):
+        step = gauss_newton_step(problem, here, layout, damping, fill)
+        enough = options.relative_decrease * best_chi2 + NOTHING
+        last = here is best and step.promised <= enough
         here = planar.compose(here, planar.exp(step.tangent))
         now = chi2(problem, here)
-        if now < best_chi2:
-            best, best_chi2, waited, damping = here, now, 0, damping / 10.0
-            damping = damping if damping > 1e-6 else 0.0
+        if now <= best_chi2:
+            before, gain = gain, best_chi2 - now
+            best, best_chi2, waited = here, now, 0
+            # Near the minimum gains shrink by a constant factor or faster: foresee the next one.
+            last = last or (damping == 0.0 and 10.0 * gain**2 <= enough * before)
+            damping = damping / 10.0 if damping > NO_DAMPING else 0.0
+        if last:
+            return Solution(best, best_chi2, iteration, converged=True)
+        if here is best:
             continue
-        waited += 1
+        waited, gain = waited + 1, 0.0
         if damping > 0.0 or waited > options.patience:
-            here, damping = best, max(10.0 * damping, 1e-4)
+            here, damping = best, max(10.0 * damping, FIRST_DAMPING)
             if damping > MAX_DAMPING:
-                break
+                return Solution(best, best_chi2, iteration, converged=False)
     return Solution(best, best_chi2, options.max_iterations, converged=False)
 
 
-def _last(problem: Problem, best: Array, best_chi2: float, step: Step, iterations: int) -> Solution:
-    """Take the last small step where it helps."""
-    poses = planar.compose(best, planar.exp(step.tangent))
-    final = chi2(problem, poses)
-    if final <= best_chi2:
-        best, best_chi2 = poses, final
-    return Solution(best, best_chi2, iterations, converged=True)
-
-
 def gauss_newton_step(
-    problem: Problem, poses: Array, layout: sparse.Pattern, damping: float = 0.0
+    problem: Problem,
+    poses: Array,
+    layout: sparse.Pattern,
+    damping: float = 0.0,
+    fill: sparse.Filling | None = None,
 ) -> Step:
     """Solve the normal equations, their diagonal raised by the part `damping` of itself."""
     if not layout.size:
         return Step(np.zeros_like(poses), 0.0)
-    matrix, gradient = normal_equations(problem, poses, layout)
+    matrix, gradient = normal_equations(problem, poses, layout, fill)
     if damping > 0.0:
         matrix.setdiag(matrix.diagonal() * (1.0 + damping))
     solved = sparse.factorised(matrix).solve(-gradient.ravel())
@@ -128,14 +130,17 @@ def gauss_newton_step(
 
 
 def normal_equations(
-    problem: Problem, poses: Array, layout: sparse.Pattern
+    problem: Problem, poses: Array, layout: sparse.Pattern, fill: sparse.Filling | None = None
 ) -> tuple[csc_array, Array]:
     """Return the information matrix of the free poses and the gradient (size, 3) of chi2 / 2."""
     linear = linearised(problem, poses)
     left_a = np.swapaxes(linear.by_a, 1, 2) @ problem.information
     left_b = np.swapaxes(linear.by_b, 1, 2) @ problem.information
     matrix = sparse.assembled(
-        layout, left_a @ linear.by_a, left_a @ linear.by_b, left_b @ linear.by_b
+        fill or sparse.filling(layout, 3),
+        left_a @ linear.by_a,
+        left_a @ linear.by_b,
+        left_b @ linear.by_b,
     )
     residual = linear.residual[:, :, None]
     gradient = sparse.gathered(layout, (left_a @ residual)[:, :, 0], (left_b @ residual)[:, :, 0])
