@@ -18,6 +18,7 @@ from groundfuse.frontend.consensus import Gate
 from groundfuse.frontend.features import FeatureOptions, Features, detect
 from groundfuse.frontend.fit import Prior
 from groundfuse.frontend.motion import MotionOptions, View, relative_pose
+from groundfuse.frontend.overhead_view import raster_cell_m
 from groundfuse.frontend.pairs import (
     Pair,
     PairOptions,
@@ -133,6 +134,20 @@ def with_matcher(options: FrontEndOptions, matcher: Matcher) -> FrontEndOptions:
     return replace(options, matcher=matcher)
 
 
+def comparable(options: FrontEndOptions, robots: Sequence[Robot]) -> FrontEndOptions:
+    """Give the paper's matcher one overhead cell for the whole team: it compares equal cells only.
+
+    The coarsest camera's cell serves all; a cell that was asked for stays.
+    """
+    overhead = options.paper.overhead
+    if options.matcher is not Matcher.PAPER or overhead.m_per_px is not None:
+        return options
+    cell_m = max(raster_cell_m(robot.camera, overhead) for robot in robots)
+    return replace(
+        options, paper=replace(options.paper, overhead=replace(overhead, m_per_px=cell_m))
+    )
+
+
 def run_front_end(
     robots: Sequence[Robot],
     options: FrontEndOptions,
@@ -141,6 +156,7 @@ def run_front_end(
     stage: Stage,
 ) -> FrontEndResult:
     """Detect, choose pairs, match, and bridge the places where a chain is cut."""
+    options = comparable(options, robots)
     frames = [(robot, frame) for robot in robots for frame in robot.frames]
     with stage("features"):
         seen_list = in_threads(
