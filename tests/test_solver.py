@@ -69,7 +69,8 @@ def test_gtsam_finds_nothing_better_at_our_optimum(seed):
     assert ours.converged
     refined = native.refined(graph, initial.held_poses(graph), ours.poses)
     assert problem.chi2(graph, refined) == pytest.approx(ours.chi2, rel=1e-9)
-    assert np.abs(planar.log(planar.between(ours.poses, refined))).max() < 1e-6
+    # gtsam stops within 1e-9 of chi2 (100): sqrt(1e-7) of a sigma of 3 cm.
+    assert np.abs(planar.log(planar.between(ours.poses, refined))).max() < 1e-5
 
 
 def test_at_the_optimum_no_step_helps_and_its_chi2_is_that_of_the_degrees_of_freedom():
