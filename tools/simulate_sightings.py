@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from groundfuse.backend.bundle_estimate import BundleCamera
 from groundfuse.backend.measurement import (
@@ -105,7 +105,7 @@ def simulate(
     low, high = paths.min(axis=0) - reach_m, paths.max(axis=0) + reach_m
     floor = rng.uniform(low, high, (int(options.density * np.prod(high - low)), 2))
     tall = options.relief(floor, rng) if options.relief else np.zeros(len(floor))
-    tree = cKDTree(floor)
+    tree = KDTree(floor)
     views: dict[FrameId, _View] = {}
     truth: dict[FrameId, Se2] = {}
     attitude: dict[FrameId, Attitude] = {}
@@ -169,7 +169,7 @@ def _edges(
     options: SightingOptions,
 ) -> list[RelativePose]:
     frames = list(views)
-    tree = cKDTree(np.array([views[frame].middle for frame in frames]))
+    tree = KDTree(np.array([views[frame].middle for frame in frames]))
     edges = []
     for i, j in sorted(tree.query_pairs(reach_m)):
         a, b = frames[i], frames[j]
@@ -189,7 +189,7 @@ def _pair(
         return None
     wrong = rng.random(len(in_a)) < options.wrong
     if wrong.any():  # a neighbouring keypoint of b instead of the right one
-        _, others = cKDTree(b.rays).query(b.rays[in_b[wrong]], k=3)
+        _, others = KDTree(b.rays).query(b.rays[in_b[wrong]], k=3)
         in_b = in_b.copy()
         in_b[wrong] = others[:, 2]
     sigma = np.full(len(in_a), options.noise_px / FOCAL_PX)
