@@ -14,6 +14,8 @@ from groundfuse.frontend.consensus import (
     Candidates,
     ConsensusOptions,
     Gate,
+    _drawn,
+    _procrustes,
     find_modes,
     one_to_one,
 )
@@ -54,10 +56,10 @@ def modes(found, *, scales=0.0, options=OPTIONS, gate=None, seed=0):
     return find_modes(found, TOLERANCE_M, scales, options, np.random.default_rng(seed), gate)
 
 
-# 40 voters with 1.5 mm of noise each: 0.3 mm and 1 mrad, if no wrong candidate votes by chance; one
-# at the edge of 10 mm takes 0.25 mm and 2 mrad more. Worst seen, with 2 mm of noise: 2.4 mm at
-# foot b, 0.0032 rad.
-NEAR_M, NEAR_RAD = 0.005, 0.012
+# Least squares over 40 voters with 1.5 mm of noise would give 0.3 mm and 1 mrad; but a motion for
+# which one wrong candidate more votes by chance is kept as it was drawn, good to the tolerance of
+# 10 mm over the view's half metre. Worst seen 2.4 mm at foot b, 14 mrad.
+NEAR_M, NEAR_RAD = 0.01, 0.025
 
 
 def assert_near(mode, truth):
@@ -80,11 +82,55 @@ def test_the_planted_motion_is_found(truth, seed, turned):
     best, *rivals = modes(found)
     assert_near(best, truth)
     assert best.scale == pytest.approx(1.0, abs=1e-12)
-    assert best.voters[:40].all()
+    assert best.voters[:40].sum() >= 38
     # A wrong candidate votes by chance only: a disc of 1 cm on 0.64 m^2 is 0.05 % of the floor.
     assert best.voters[40:].sum() <= 2
     assert best.votes >= 40
     assert all(rival.votes < 0.4 * best.votes for rival in rivals)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.15, 0.9])
+def test_every_draw_from_exact_matches_is_the_motion(scale):
+    """Without noise or wrong candidates; nearly all pairs of points are long enough."""
+    exact = planted(np.random.default_rng(13), wrong=0, noise_m=0.0, scale=scale)
+    most = 0.0 if scale == 1.0 else 0.2
+    drawn = _drawn(exact, TOLERANCE_M, most, OPTIONS, np.random.default_rng(0))
+    c, s = math.cos(TRUTH.theta_rad), math.sin(TRUTH.theta_rad)
+    wanted = [scale * c, scale * s, TRUTH.x_m, TRUTH.y_m]
+    np.testing.assert_allclose(drawn, np.broadcast_to(wanted, drawn.shape), atol=1e-12)
+    assert len(drawn) > 0.9 * OPTIONS.num_draws
+
+
+@given(
+    st.builds(Se2, st.floats(-2, 2), st.floats(-2, 2), st.floats(-math.pi, math.pi)),
+    st.floats(0.8, 1.25),
+    st.integers(0, 2**16),
+)
+def test_least_squares_over_the_voters(truth, scale, seed):
+    """Against the linear solution of a similarity; the isometry keeps its heading."""
+    rng = np.random.default_rng(seed)
+    b = rng.uniform(-0.5, 0.5, (20, 2))
+    a = truth.apply(scale * b) + 0.01 * rng.standard_normal((20, 2))
+    one, zero = np.ones(20), np.zeros(20)
+    design = np.vstack(
+        [
+            np.column_stack([b[:, 0], -b[:, 1], one, zero]),
+            np.column_stack([b[:, 1], b[:, 0], zero, one]),
+        ]
+    )
+    linear = np.linalg.lstsq(design, np.concatenate([a[:, 0], a[:, 1]]), rcond=None)[0]
+    found = _procrustes(a, b, 0.5)
+    # The scale of the linear solution is that of b to a: the same sum of squares.
+    np.testing.assert_allclose(found, linear, atol=1e-9)
+    rigid = _procrustes(a, b, 0.0)
+    assert np.hypot(*rigid[:2]) == pytest.approx(1.0)
+    assert math.atan2(rigid[1], rigid[0]) == pytest.approx(math.atan2(linear[1], linear[0]))
+    np.testing.assert_allclose(
+        Se2(rigid[2], rigid[3], math.atan2(rigid[1], rigid[0])).apply(b).mean(axis=0),
+        a.mean(axis=0),
+    )
+    narrow = _procrustes(a, b, 0.01)
+    assert abs(math.log(np.hypot(*narrow[:2]))) <= 0.01 + 1e-12
 
 
 def test_a_repeated_floor_shows_as_a_rival_of_equal_weight():
@@ -108,8 +154,10 @@ def test_motions_that_differ_in_turn_alone_are_rivals():
 
 def test_one_motion_is_not_its_own_rival():
     """Hypotheses on the slope of the best motion climb back to it."""
-    found = modes(planted(np.random.default_rng(3), wrong=0, noise_m=0.004))
-    assert all(mode.votes < 20 for mode in found[1:])
+    for noise_m, apart in ((0.004, OPTIONS.distinct_tolerances), (0.0015, 0.5)):
+        found = planted(np.random.default_rng(3), wrong=0, noise_m=noise_m)
+        options = dataclasses.replace(OPTIONS, distinct_tolerances=apart)
+        assert all(mode.votes < 20 for mode in modes(found, options=options)[1:])
 
 
 def test_a_gate_leaves_the_rival_out():
@@ -139,8 +187,13 @@ def test_a_gate_judges_the_place_and_the_turn_apart():
     best = modes(far, gate=Gate(Se2(0.0, 0.0, 0.55), 0.02, 0.1))[0]
     assert best.voters[:40].all()
     assert best.a_from_b.theta_rad == pytest.approx(0.6, abs=NEAR_RAD)
-    aside = Gate(Se2(0.0, 0.1, 0.6), 0.02, 0.1)  # the turn is right: no swing excuses the place
-    assert all(mode.votes < 5 for mode in modes(far, gate=aside))
+    # The turn is right, so no swing excuses the place, and a draw that is turned enough to be let
+    # in does not climb back to it.
+    shaky = far._replace(floor_a=far.floor_a + 0.004 * rng.standard_normal(far.floor_a.shape))
+    assert modes(shaky)[0].votes > 30
+    aside = Gate(Se2(0.0, 0.08, 0.6), 0.02, 0.15)
+    for mode in modes(shaky, gate=aside):
+        assert mode.votes < 15 or abs(mode.a_from_b.theta_rad - 0.6) > 0.04
 
 
 def test_a_similarity_is_found_where_it_is_looked_for():
