@@ -189,7 +189,7 @@ def _pair(
         return None
     wrong = rng.random(len(in_a)) < options.wrong
     if wrong.any():  # a neighbouring keypoint of b instead of the right one
-        _, others = KDTree(b.rays).query(b.rays[in_b[wrong]], k=3)
+        others = np.asarray(KDTree(b.rays).query(b.rays[in_b[wrong]], k=3)[1])
         in_b = in_b.copy()
         in_b[wrong] = others[:, 2]
     sigma = np.full(len(in_a), options.noise_px / FOCAL_PX)
