@@ -9,10 +9,8 @@ tracks, and the second stage solves for all of them. numpy and scipy only.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from enum import Enum, auto
 
 import numpy as np
-from numpy.typing import NDArray
 
 from groundfuse.backend.bundle_cholesky import NotPositiveDefiniteError
 from groundfuse.backend.bundle_cut import Cut, cut, link_chi2
@@ -35,6 +33,7 @@ from groundfuse.backend.bundle_model import State
 from groundfuse.backend.bundle_priors import Priors
 from groundfuse.backend.bundle_relief import settle_relief
 from groundfuse.backend.bundle_report import Ends, report
+from groundfuse.backend.bundle_sample import sampled, thinned
 from groundfuse.backend.bundle_setup import (
     Team,
     between_of,
@@ -50,30 +49,34 @@ from groundfuse.backend.bundle_tracks import (
     Links,
     Sightings,
     observations,
-    sampled,
     sightings_from_edges,
     single_links,
-    thinned,
     tracks,
 )
 from groundfuse.backend.measurement import Attitude, FrameId, RelativePose, TeamEstimate
 
-Mask = NDArray[np.bool_]
+Points = tuple[Integers, Integers]
 
-START_SETTLED, SETTLED = 10.0, 0.1
-"""Chi-square that a last step may still gain: far below one sigma of anything in the end."""
+LEAST_TRIAL, LEAST_SIGHTINGS = 60, 250
+"""Sightings per frame that a large team keeps, in the trial and in the end."""
 DEFAULT = BundleOptions()
 
 
-class Sample(Enum):
-    """Which sightings a stage uses."""
+@dataclass(frozen=True, slots=True)
+class Goal:
+    """How far to go and where to begin.
 
-    LINKS = auto()
-    """A few correspondences, each a floor point of its own."""
-    TRACKS = auto()
-    """Some floor points with all their sightings."""
-    ALL = auto()
-    """Everything."""
+    Attributes:
+        settled: chi-square of all poses together that the last step may still have.
+        noise: first guess of the keypoints' noise over its promise.
+    """
+
+    settled: float
+    noise: float = 1.0
+
+
+START, LAST = Goal(1.0), Goal(0.04)
+"""In the end a fifth of one sigma, in one direction of all."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,25 +148,38 @@ def _solved(
     """Cut wrong correspondences, see whether the floor is flat and the files hold, and solve."""
     options = job.options
     clean = cut(job.links, job.edges, np.zeros(len(job.links), dtype=np.bool_), options)
-    first = _stage(job, clean, priors, state, Sample.LINKS)
+    thin = thinned(clean.links, job.sightings, options.start_sightings)
+    first = _stage(job, clean, priors, state, single_links(clean.links.only(thin)), START)
     if isinstance(first, BundleRefusal):
         return first
     _, rough = first
     free = contradicted(files_test(*first, options), priors, options)
     priors, state = freed_priors(priors, free), as_filed(rough.state, free)
-    clean = _cleaned(job, priors, rough, rough.state)
-    trial = _stage(job, clean, priors, state, Sample.TRACKS)
+    clean = _cleaned(job, priors, rough, state)
+    joined = _joined(job, clean)
+    num_frames = len(job.team.frames)
+    most = max(options.trial_sightings // num_frames, LEAST_TRIAL)
+    points = sampled(*joined, job.sightings, most)
+    trial = _stage(job, clean, priors, state, points, replace(START, noise=rough.noise))
     if isinstance(trial, BundleRefusal):
         return trial
-    relief, state = settle_relief(*trial, options, START_SETTLED)
+    relief, better = settle_relief(*trial, options, START.settled)
     if relief > 0.0:
         priors = replace(priors, relief=relief)
-        clean = _cleaned(job, priors, trial[1], state)
-    last = _stage(job, clean, priors, state, Sample.ALL)
+        clean = _cleaned(job, priors, better, better.state)
+        joined = _joined(job, clean)
+    most = max(options.most_sightings // num_frames, LEAST_SIGHTINGS)
+    points = sampled(*joined, job.sightings, most)
+    last = _stage(job, clean, priors, better.state, points, replace(LAST, noise=better.noise))
     if isinstance(last, BundleRefusal):
         return last
-    problem, solution, test = with_better_files(*last, options, SETTLED)
+    problem, solution, test = with_better_files(*last, options, LAST.settled)
     return problem, solution, clean, test
+
+
+def _joined(job: Job, clean: Cut) -> Points:
+    """Join correspondences into floor points."""
+    return tracks(clean.links, job.sightings) if job.options.tracks else single_links(clean.links)
 
 
 def _cleaned(job: Job, priors: Priors, rough: Solution, state: State) -> Cut:
@@ -173,17 +189,14 @@ def _cleaned(job: Job, priors: Priors, rough: Solution, state: State) -> Cut:
 
 
 def _stage(
-    job: Job, clean: Cut, priors: Priors, state: State, sample: Sample
+    job: Job, clean: Cut, priors: Priors, state: State, points: Points, goal: Goal
 ) -> tuple[Problem, Solution] | BundleRefusal:
-    """Solve with some of the sightings or all."""
-    options = job.options
-    if len(clean.links) < options.min_links:
-        text = f"{len(clean.links)} correspondences in all, {options.min_links} needed for a pair"
-        return BundleRefusal(
-            Illposed.NO_POINTS, float(len(clean.links)), float(options.min_links), text
-        )
-    used, point = _sample(job, clean, sample)
-    seen = observations(job.sightings, used, point, priors.num_frames)
+    """Solve with some floor points."""
+    options, used = job.options, len(clean.links)
+    if used < options.min_links:
+        text = f"{used} correspondences in all, {options.min_links} needed for a pair"
+        return BundleRefusal(Illposed.NO_POINTS, float(used), float(options.min_links), text)
+    seen = observations(job.sightings, *points, priors.num_frames)
     between = between_of(clean.weak, job.team, job.cameras)
     loose = loose_frame(seen.pair_key, between, job.team)
     if loose is not None:
@@ -195,17 +208,7 @@ def _stage(
         with_points(state, seen, priors.robot_of),
         width=options.robust_sigma,
         iterations=options.iterations,
-        settled=SETTLED if sample is Sample.ALL else START_SETTLED,
+        settled=goal.settled,
+        noise=goal.noise,
     )
     return problem, solution
-
-
-def _sample(job: Job, clean: Cut, sample: Sample) -> tuple[Integers, Integers]:
-    """Sightings and floor points, (sighting, point) of every observation."""
-    if sample is Sample.LINKS:
-        thin = thinned(clean.links, job.sightings, job.options.start_sightings)
-        return single_links(clean.links.only(thin))
-    joined = tracks(clean.links, job.sightings) if job.options.tracks else single_links(clean.links)
-    if sample is Sample.ALL:
-        return joined
-    return sampled(*joined, job.sightings, job.options.trial_sightings)

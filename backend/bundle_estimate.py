@@ -42,8 +42,10 @@ class BundleOptions:
     They are wide because a real floor waves, so that the points of a view share most of it."""
     tracks: bool = True
     """Join correspondences that share a keypoint into one floor point; else each is its own."""
-    trial_sightings: int = 200
-    """Sightings per frame in the trial that tells a flat floor from one with relief."""
+    most_sightings: int = 100_000
+    """Sightings that take part, as whole floor points; a frame keeps 250 at least."""
+    trial_sightings: int = 30_000
+    """Sightings in the trial whether the floor is flat; a frame keeps 60 at least."""
     start_sightings: int = 250
     """Correspondences per frame in the first stage, which is robust against single wrong ones."""
     robust_sigma: float = 3.0
@@ -68,6 +70,7 @@ class BundleOptions:
             "focal_sigma",
             "distortion_sigma",
             "file_gate_sigma",
+            "most_sightings",
             "trial_sightings",
             "start_sightings",
             "robust_sigma",

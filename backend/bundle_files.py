@@ -10,14 +10,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from groundfuse.backend.bundle_cholesky import inverse_between
+from groundfuse.backend.bundle_cholesky import Factor, factorise, inverse_between
 from groundfuse.backend.bundle_estimate import BundleOptions, Refine
+from groundfuse.backend.bundle_kernel import Kernel
 from groundfuse.backend.bundle_model import State
 from groundfuse.backend.bundle_priors import Priors
 from groundfuse.backend.bundle_solve import (
-    Kernel,
     Problem,
     Solution,
+    System,
     minimise,
     step_from,
     system_at,
@@ -37,11 +38,13 @@ class FileTest:
         value: (robots, 6) corrections of the files, as in `State.shared`.
         covariance: (6 robots, 6 robots) of them.
         asked: (robots, 5) which were asked for.
+        factor: of the system with only those free that the solution has free.
     """
 
     value: Array
     covariance: Array
     asked: Mask
+    factor: Factor
 
     @property
     def sigma(self) -> Array:
@@ -55,12 +58,28 @@ def files_test(problem: Problem, solution: Solution, options: BundleOptions) -> 
     lens = np.array([options.focal, options.distortion]) != Refine.NEVER
     asked = np.tile(np.concatenate([[True] * 3, lens]), (priors.num_robots, 1))
     trial = replace(problem, priors=freed_priors(priors, asked))
-    kernel = Kernel(options.robust_sigma, solution.noise)
+    kernel = Kernel(options.robust_sigma, solution.noise, solution.noise)
     system = system_at(trial, solution.state, solution.errors, kernel, 0.0)
-    _, step = step_from(trial, system, solution.state, solution.errors, kernel)
+    _, step, _ = step_from(trial, system, solution.state, solution.errors, kernel)
     robots = np.arange(priors.num_frames, priors.num_nodes)
     value = solution.state.shared + step[robots]
-    return FileTest(value, inverse_between(system.factor, robots), asked)
+    covariance = inverse_between(system.factor, robots)
+    return FileTest(value, covariance, asked, _held_factor(problem, system, asked))
+
+
+def _held_factor(problem: Problem, system: System, asked: Mask) -> Factor:
+    """Factorise a system with the numbers held that were free only for the test."""
+    priors, pattern = problem.priors, problem.pattern
+    held = asked & ~np.hstack([priors.free_mount, priors.free_lens])
+    if not held.any():
+        return system.factor
+    blocks = system.reduced.blocks.copy()
+    for robot, axis in np.argwhere(held).tolist():
+        node = priors.num_frames + robot
+        blocks[pattern.rows == node, axis, :] = 0.0
+        blocks[pattern.columns == node, :, axis] = 0.0
+        blocks[node, axis, axis] = 1.0
+    return factorise(problem.fronts, blocks, priors.num_nodes)
 
 
 def freed_priors(priors: Priors, free: Mask) -> Priors:
@@ -108,5 +127,6 @@ def with_better_files(
         width=options.robust_sigma,
         iterations=options.iterations,
         settled=settled,
+        noise=solution.noise,
     )
     return problem, solution, files_test(problem, solution, options)

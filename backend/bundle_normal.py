@@ -11,31 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from groundfuse.backend.bundle_cholesky import BLOCK
-from groundfuse.backend.bundle_model import State, derivatives, through_lens, view_of
+from groundfuse.backend.bundle_plan import BLOCK
 from groundfuse.backend.bundle_priors import Pattern, Priors
+from groundfuse.backend.bundle_rows import Rows
 from groundfuse.backend.bundle_tracks import Integers, Observations
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Rows:
-    """Whitened derivatives of all sightings.
-
-    Attributes:
-        by_frame: (6, n, 2).
-        by_point: (d, n, 2): by x and y, and z where the floor has relief.
-        by_lens: (2, n, 2); (2, 0, 2) where lenses are as filed.
-        relief: (3, points) of the relief's prior at each point: its residual -z / (relief h), and
-            the derivatives of z / (relief h) by z and by the height h of the first camera that
-            sees the point; (3, 0) on a flat floor.
-    """
-
-    by_frame: Array
-    by_point: Array
-    by_lens: Array
-    relief: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,38 +38,6 @@ class Reduced:
     by_lens: Array | None
     root: Array
     blocks: Array
-
-
-def whitened_rows(seen: Observations, state: State, weight: Array, priors: Priors) -> Rows:
-    """Differentiate all sightings; `weight` (n,) is the kernel's over the variance."""
-    count, lens = len(seen.frame), bool(priors.free_lens.any())
-    size = 3 if priors.relief > 0.0 else 2
-    by_frame, by_point = np.empty((BLOCK, count, 2)), np.empty((size, count, 2))
-    by_lens, root_weight = np.empty((2, count if lens else 0, 2)), np.sqrt(weight)[:, None]
-    for part in seen.parts:
-        view = view_of(seen, state, part)
-        found = derivatives(view)
-        robot = priors.robot_of[seen.frame[part]]
-        if lens or state.shared[:, 3:5].any():
-            found = through_lens(found, view, state.shared[robot])
-        if lens:
-            free = priors.free_lens[robot].T[:, :, None]
-            by_lens[:, part] = found.by_lens * root_weight[part] * free
-        by_frame[:, part] = found.by_frame * root_weight[part]
-        by_point[:, part] = found.by_point[:size] * root_weight[part]
-    for index in np.flatnonzero(priors.fixed).tolist():
-        by_frame[:3, seen.frame_start[index] : seen.frame_start[index + 1]] = 0.0
-    return Rows(by_frame, by_point, by_lens, relief_rows(seen, state, priors))
-
-
-def relief_rows(seen: Observations, state: State, priors: Priors) -> Array:
-    """Prior of the floor points' heights, see `Rows`."""
-    if priors.relief == 0.0:
-        return np.zeros((3, 0))
-    height = state.attitude[seen.frame[seen.first], 2]
-    by_z = 1.0 / (priors.relief * height)
-    value = state.point[:, 2] * by_z
-    return np.stack([-value, by_z, -value / height])
 
 
 def _by_points(values: Array, point: Integers, num_points: int) -> Array:
@@ -205,12 +154,12 @@ def _add_pairs(seen: Observations, by_frame: Array, pattern: Pattern, blocks: Ar
     for chunk in seen.pair_parts:
         start = bounds[chunk.start]
         inside = slice(start, bounds[chunk.stop])
-        first = np.take(by_frame, seen.pair_i[inside], axis=1)
+        first = -np.take(by_frame, seen.pair_i[inside], axis=1)
         second = np.take(by_frame, seen.pair_j[inside], axis=1)
         for index in range(chunk.start, chunk.stop):
             part = slice(bounds[index] - start, bounds[index + 1] - start)
             a, b = first[:, part].reshape(BLOCK, -1), second[:, part].reshape(BLOCK, -1)
-            blocks[place[index]] = -(a @ b.T)
+            np.matmul(a, b.T, out=blocks[place[index]])
 
 
 def _lens_by_points(seen: Observations, lens_rows: Array, priors: Priors) -> Array:
@@ -254,7 +203,8 @@ def point_steps(
     """Steps (points, d) of the floor points that go with a step (frames + robots, 6)."""
     change = np.empty((len(seen.frame), len(reduced.basis)))
     for frame, part in enumerate(frame_parts(seen)):
-        change[part] = np.tensordot(step[frame], reduced.by_frame[:, part], axes=1)
+        rows = reduced.by_frame[:, part].reshape(BLOCK, -1)
+        change[part] = (step[frame] @ rows).reshape(-1, change.shape[1])
     rest = explained - _by_points(change, seen.point, seen.num_points)
     if reduced.by_lens is not None:
         flat = reduced.by_lens.reshape(*rest.shape, -1)

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from groundfuse.backend.bundle_cholesky import BLOCK
 from groundfuse.backend.bundle_model import State
+from groundfuse.backend.bundle_plan import BLOCK
 from groundfuse.backend.bundle_tracks import Integers
 from groundfuse.backend.measurement import Se2
 

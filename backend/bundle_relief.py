@@ -12,12 +12,14 @@ from dataclasses import replace
 import numpy as np
 
 from groundfuse.backend.bundle_estimate import BundleOptions, Refine
-from groundfuse.backend.bundle_model import State
+from groundfuse.backend.bundle_rows import relief_rows
 from groundfuse.backend.bundle_solve import Problem, Solution, minimise
 
 GATE_SIGMA = 3.0
 MARGIN = 0.01
 """Residuals must fall by so many sigmas of their own variance, and by this fraction besides."""
+ROOM = 0.1
+"""A rougher floor is not tried where heights use less than this of the variance allowed."""
 
 
 def misfit(problem: Problem, solution: Solution, clip: float) -> tuple[float, float]:
@@ -40,10 +42,10 @@ def explains_more(
 
 def settle_relief(
     problem: Problem, solution: Solution, options: BundleOptions, settled: float
-) -> tuple[float, State]:
-    """Return the relief that the sightings ask for, 0 for a flat floor, and the state with it."""
+) -> tuple[float, Solution]:
+    """Return the relief that the sightings ask for, 0 if flat, and the solution with it."""
     if options.relief is Refine.NEVER:
-        return 0.0, solution.state
+        return 0.0, solution
     best = problem, solution
     levels = options.relief_levels
     for level in levels[-1:] if options.relief is Refine.ALWAYS else levels:
@@ -54,9 +56,13 @@ def settle_relief(
             width=options.robust_sigma,
             iterations=options.iterations,
             settled=settled,
+            noise=best[1].noise,
         )
         better = explains_more(best, (rougher, found), options.robust_sigma)
         if not better and options.relief is not Refine.ALWAYS:
             break
         best = rougher, found
-    return best[0].priors.relief, best[1].state
+        heights = relief_rows(problem.seen, found.state, rougher.priors)[0]
+        if float(np.mean(heights**2)) < ROOM:
+            break
+    return best[0].priors.relief, best[1]

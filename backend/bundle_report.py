@@ -41,10 +41,10 @@ def report(
 ) -> BundleEstimate:
     """Collect the answer from the solution."""
     priors, state, team = problem.priors, solution.state, ends.team
-    diagonal = inverse_diagonal(solution.factor)
+    diagonal = inverse_diagonal(test.factor)
     sigma = np.sqrt(np.einsum("nii->ni", diagonal)[: priors.num_frames, 3:])
     mounts = _mounts(ends, problem, test)
-    scale_sigma = _scale_sigma(problem, solution)
+    scale_sigma = _scale_sigma(problem, solution, test)
     return BundleEstimate(
         team=_team_estimate(ends, problem, solution, diagonal),
         attitude={f: Attitude(*state.attitude[n].tolist()) for n, f in enumerate(team.frames)},
@@ -138,13 +138,13 @@ def _mounts(ends: Ends, problem: Problem, test: FileTest) -> tuple[MountEstimate
     return tuple(mounts)
 
 
-def _scale_sigma(problem: Problem, solution: Solution) -> float:
+def _scale_sigma(problem: Problem, solution: Solution, test: FileTest) -> float:
     """Standard deviation of the map's scale: of the mounts' mean, and of the mean wobble."""
     priors, state = problem.priors, solution.state
     group = priors.group_of[priors.robot_of[np.flatnonzero(priors.fixed)[0]]]
     members = np.flatnonzero(priors.group_of[priors.robot_of] == group)
     mean = np.zeros((priors.num_nodes, 6))
     mean[members, 5] = 1.0 / (len(members) * state.attitude[members, 2])
-    wobble = float(mean.ravel() @ solve(solution.factor, mean.ravel()))
+    wobble = float(mean.ravel() @ solve(test.factor, mean.ravel()))
     mounts = float(priors.shared_sigma[2]) ** 2 / int((priors.group_of == group).sum())
     return math.sqrt(wobble + mounts)

@@ -5,24 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from groundfuse.backend.bundle_cholesky import (
-    BLOCK,
-    Factor,
-    Front,
-    NotPositiveDefiniteError,
-    factorise,
-    plan,
-    solve,
-)
-from groundfuse.backend.bundle_model import State, moved, residuals
-from groundfuse.backend.bundle_normal import (
-    Reduced,
-    point_steps,
-    reduce_rows,
-    relief_rows,
-    right_side,
-    whitened_rows,
-)
+from groundfuse.backend.bundle_cholesky import Factor, NotPositiveDefiniteError, factorise, solve
+from groundfuse.backend.bundle_kernel import Errors, Kernel, errors_of, noise_factor
+from groundfuse.backend.bundle_model import State, moved
+from groundfuse.backend.bundle_normal import Reduced, point_steps, reduce_rows, right_side
+from groundfuse.backend.bundle_plan import BLOCK, Front, plan
 from groundfuse.backend.bundle_priors import (
     Between,
     Pattern,
@@ -34,18 +21,19 @@ from groundfuse.backend.bundle_priors import (
     prior_cost,
     prior_right,
 )
+from groundfuse.backend.bundle_rows import relief_rows, whitened_rows
 from groundfuse.backend.bundle_tracks import Observations
 
 Array = NDArray[np.float64]
 
 LEAST_DAMPING, FIRST_DAMPING, MOST_DAMPING = 1e-10, 1e-6, 1e6
-UNSEEN_RATIO = 1e4
-"""A sighting behind the camera costs as much as one a hundred kernel widths off."""
 CHORD_GAIN = 0.3
-"""A step that gains more than this share of the one before asks for new derivatives."""
-LEAST_FREEDOM = 0.9
-"""Points with fewer degrees of freedom say nothing about the noise."""
-NOISE_CHANGE = 0.02
+"""A step whose chi-square is more than this share of the last one's asks for new derivatives."""
+LEAST_SLOW = 1.0
+"""Below one sigma of one unknown slowness does not matter."""
+ROUNDING = 1e-7
+"""Share of the cost by which it may rise in a step that is as good as none."""
+NOISE_CHANGE = 0.1
 """So does a noise that has changed by this fraction."""
 
 
@@ -58,21 +46,6 @@ class Problem:
     between: Between
     pattern: Pattern
     fronts: tuple[Front, ...]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Errors:
-    """How far the sightings are from the model.
-
-    Attributes:
-        residual: (n, 2) measured minus predicted rays; 0 where unseen.
-        unseen: (n,) whether the point is behind the camera.
-        chi2: (n,) squared residual over the promised variance; 0 where unseen.
-    """
-
-    residual: Array
-    unseen: NDArray[np.bool_]
-    chi2: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,7 +75,6 @@ class Solution:
         state: the unknowns.
         errors: the sightings there.
         weight: (n,) kernel weights, 0 to 1.
-        factor: of the reduced system near there, without damping.
         noise: residuals over the promised sigmas, robust.
         absorbed: (points,) how many residuals each floor point takes.
         steps: accepted steps.
@@ -112,7 +84,6 @@ class Solution:
     state: State
     errors: Errors
     weight: Array
-    factor: Factor
     noise: float
     absorbed: Array
     steps: int
@@ -127,61 +98,12 @@ def problem_of(seen: Observations, priors: Priors, between: Between) -> Problem:
     return Problem(seen, priors, between, pattern, fronts)
 
 
-def errors_of(problem: Problem, state: State) -> Errors:
-    """Compare all sightings with the model."""
-    seen = problem.seen
-    residual, unseen = residuals(seen, state, problem.priors.robot_of)
-    residual[unseen] = 0.0
-    chi2 = (residual[:, 0] ** 2 + residual[:, 1] ** 2) / seen.sigma**2
-    return Errors(residual, unseen, chi2)
-
-
-def noise_factor(seen: Observations, errors: Errors, absorbed: Array) -> float:
-    """Median residual of the floor points over what the sigmas promise.
-
-    A point seen k times has 2 k residuals and absorbs 2 of them, or up to 3 where the floor has
-    relief (`absorbed`, (points,)), which leaves chi-square with v = 2 k - absorbed degrees of
-    freedom; its median is near v (1 - 2 / 9 v)^3 (Wilson and Hilferty 1931).
-    """
-    total = np.bincount(seen.point, errors.chi2, seen.num_points)
-    freedom = 2.0 * np.bincount(seen.point, ~errors.unseen, seen.num_points) - absorbed
-    several = freedom > LEAST_FREEDOM
-    total, freedom = total[several], freedom[several]
-    if len(total) == 0:
-        return 1.0
-    median = freedom * (1.0 - 2.0 / (9.0 * freedom)) ** 3
-    taken = 3.0 * (len(seen.frame_start) - 1)  # each frame's pose absorbs as well
-    left = max(freedom.sum() - taken, 1.0) / freedom.sum()
-    return float(np.sqrt(np.median(total / median) / left))
-
-
 def _absorbed(problem: Problem, system: "System") -> Array:
     """How many residuals each floor point absorbs: 2, and of its height what the prior leaves."""
     absorbed = np.full(problem.seen.num_points, 2.0)
     if problem.priors.relief > 0.0:
         absorbed += 1.0 - (system.reduced.rows.relief[1] / system.reduced.root[2, 2]) ** 2
     return absorbed
-
-
-@dataclass(frozen=True, slots=True)
-class Kernel:
-    """Cauchy on whitened residuals: `width` sigmas of the promised noise times `noise`."""
-
-    width: float
-    noise: float
-
-    def ratio(self, errors: Errors) -> Array:
-        """Squared residuals over the squared width (n,)."""
-        chi2 = errors.chi2 / (self.width * self.noise) ** 2
-        return np.where(errors.unseen, UNSEEN_RATIO, chi2)
-
-    def weight(self, errors: Errors) -> Array:
-        """Weights (n,), 0 to 1."""
-        return np.where(errors.unseen, 0.0, 1.0 / (1.0 + self.ratio(errors)))
-
-    def cost(self, errors: Errors) -> float:
-        """Twice the negative log likelihood."""
-        return float(self.width**2 * np.sum(np.log1p(self.ratio(errors))))
 
 
 def _cost(problem: Problem, state: State, errors: Errors, kernel: Kernel) -> float:
@@ -199,7 +121,7 @@ def system_at(
         NotPositiveDefiniteError: the unknowns are not determined.
     """
     seen, priors = problem.seen, problem.priors
-    weight = kernel.weight(errors) / (kernel.noise * seen.sigma) ** 2
+    weight = kernel.information(errors, seen.sigma)
     rows = whitened_rows(seen, state, weight, priors)
     reduced = reduce_rows(seen, rows, problem.pattern, priors)
     prior_blocks(reduced.blocks, priors, problem.pattern)
@@ -218,13 +140,13 @@ def _factor(problem: Problem, reduced: Reduced, damping: float) -> Factor:
 
 def step_from(
     problem: Problem, system: System, state: State, errors: Errors, kernel: Kernel
-) -> tuple[State, Array]:
-    """Return the state after a step and the nodes' step (frames + robots, 6).
+) -> tuple[State, Array, float]:
+    """Return the state after a step, the nodes' step (frames + robots, 6), and its chi-square.
 
     The gradient is the state's own; the system may be of an earlier one (a chord step).
     """
     seen, priors = problem.seen, problem.priors
-    weight = kernel.weight(errors) / (kernel.noise * seen.sigma) ** 2
+    weight = kernel.information(errors, seen.sigma)
     root = np.sqrt(system.weight)
     scale = np.divide(weight, root, out=np.zeros_like(weight), where=root > 0.0)
     error = errors.residual * scale[:, None]
@@ -233,49 +155,63 @@ def step_from(
     right += prior_right(state, priors) + between_right(state, problem.between, priors)
     step = solve(system.factor, right.ravel()).reshape(-1, BLOCK)
     points = point_steps(seen, system.reduced, explained, step, priors)
-    return moved(state, step, points), step
+    return moved(state, step, points), step, float(np.sum(step * right))
 
 
 def minimise(
-    problem: Problem, state: State, *, width: float, iterations: int, settled: float
+    problem: Problem,
+    state: State,
+    *,
+    width: float,
+    iterations: int,
+    settled: float,
+    noise: float = 1.0,
 ) -> Solution:
-    """Minimise the robust cost until a step lowers it by less than `settled` (chi-square).
+    """Minimise the robust cost until a step moves frames and robots by less than `settled`.
 
-    The kernel's scale follows the residuals: wide while the start is rough, and in the end as wide
-    as the noise that is there. Derivatives and factor are kept as long as steps with them converge
-    quickly.
+    That is the step's chi-square after the floor points are eliminated: 0.01 is a tenth of a sigma
+    in one direction. Points of wrong correspondences may go on drifting; they hold nothing.
+
+    The kernel follows the residuals: wide while the start is rough, and in the end as wide as the
+    noise that is there. `noise` is a first guess of that, over what is promised: the start's
+    residuals come from its poses. Derivatives and factor are kept as long as steps with them
+    converge quickly.
 
     Raises:
         NotPositiveDefiniteError: the unknowns are not determined.
     """
-    errors, system, last_gain = errors_of(problem, state), None, np.inf
+    errors, system, last_chi2 = (
+        errors_of(problem.seen, state, problem.priors.robot_of),
+        None,
+        np.inf,
+    )
     absorbed = np.full(problem.seen.num_points, 2.0)
     damping, steps, done = 0.0, 0, False
     while True:
-        kernel = Kernel(width, noise_factor(problem.seen, errors, absorbed))
+        spread = noise_factor(problem.seen, errors, absorbed)
+        kernel = Kernel(width, spread, spread if steps else noise)
+        if done or steps == iterations:
+            break
         if system is None or abs(kernel.noise / system.noise - 1.0) > NOISE_CHANGE:
             system = _damped_system(problem, state, errors, kernel, damping)
             absorbed = _absorbed(problem, system)
-        if done or steps == iterations:
-            break
-        tried, _ = step_from(problem, system, state, errors, kernel)
-        tried_errors = errors_of(problem, tried)
-        gain = _cost(problem, state, errors, kernel) - _cost(problem, tried, tried_errors, kernel)
-        if gain > -settled:  # rounding may raise a settled cost
-            state, errors, steps, done = tried, tried_errors, steps + 1, gain < settled
+        tried, _, chi2 = step_from(problem, system, state, errors, kernel)
+        tried_errors = errors_of(problem.seen, tried, problem.priors.robot_of)
+        before = _cost(problem, state, errors, kernel)
+        if _cost(problem, tried, tried_errors, kernel) < before + settled + ROUNDING * before:
+            state, errors, steps = tried, tried_errors, steps + 1
+            done = chi2 < settled and system.damping == 0.0
             damping = system.damping / 10.0 if system.damping > FIRST_DAMPING else 0.0
-            slow = gain > CHORD_GAIN * last_gain and not done
-            system, last_gain = (None, np.inf) if slow or damping else (system, gain)
-        elif last_gain < np.inf:
-            system, last_gain = None, np.inf
+            slow = chi2 > max(CHORD_GAIN * last_chi2, LEAST_SLOW) and not done
+            system, last_chi2 = (None, np.inf) if slow or damping else (system, chi2)
+        elif last_chi2 < np.inf:
+            system, last_chi2 = None, np.inf
         elif system.damping < MOST_DAMPING:
             damping = max(system.damping * 100.0, FIRST_DAMPING)
             system = None
         else:
             done = True
-    factor = _factor(problem, system.reduced, 0.0) if system.damping else system.factor
-    weight = kernel.weight(errors)
-    return Solution(state, errors, weight, factor, kernel.noise, absorbed, steps, done)
+    return Solution(state, errors, kernel.weight(errors), kernel.noise, absorbed, steps, done)
 
 
 def _damped_system(

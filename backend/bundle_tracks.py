@@ -17,6 +17,7 @@ from groundfuse.backend.measurement import FrameId, RelativePose
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
+Keys = NDArray[np.uint64]
 
 # Odd constants of 64 bits mix frame and ray bits into one key; two keypoints among a million share
 # one by accident with probability 3e-8, and would then only make one wrong correspondence.
@@ -25,7 +26,6 @@ MIX = tuple(
     for number in (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9, 0xD6E8FEB86659FD93)
 )
 
-ROUNDING = 1e-9
 PIECE = 4096
 """Sightings worked on at once: their derivatives, 0.4 MB, stay in the second-level cache."""
 
@@ -93,9 +93,10 @@ class Observations:
     pair_parts: tuple[slice, ...]
 
 
-def _keys(frame: Integers, ray: Array) -> NDArray[np.uint64]:
+def mixed_keys(number: Integers, ray: Array) -> Keys:
+    """Mix a number and the bits of a ray (n, 2) into one key (n,)."""
     bits = np.ascontiguousarray(ray + 0.0).view(np.uint64)  # + 0.0: one zero, not two
-    mixed = (frame.astype(np.uint64) + np.uint64(1)) * MIX[0]
+    mixed = (number.astype(np.uint64) + np.uint64(1)) * MIX[0]
     for axis, factor in enumerate(MIX[1:3]):
         mixed = (mixed ^ (bits[:, axis] * factor)) * MIX[3]
         mixed ^= mixed >> np.uint64(32)
@@ -118,7 +119,7 @@ def sightings_from_edges(
         none = np.zeros(0, dtype=np.int64)
         return Sightings(none, np.zeros((0, 2)), np.zeros(0)), Links(none, none, none)
     frame, ray, sigma = np.concatenate(frames), np.concatenate(rays), np.concatenate(sigmas)
-    _, first, which = np.unique(_keys(frame, ray), return_index=True, return_inverse=True)
+    _, first, which = np.unique(mixed_keys(frame, ray), return_index=True, return_inverse=True)
     # The start of each pair's two runs: a comes first, b follows.
     size = np.array(counts)
     edge_of = np.repeat(np.arange(len(edges)), size)
@@ -128,24 +129,6 @@ def sightings_from_edges(
     # Every pair has an estimate of its own of how noisy its keypoints are.
     mean_square = np.bincount(which, sigma**2) / np.bincount(which)
     return Sightings(frame[first], ray[first], np.sqrt(mean_square)), links
-
-
-def thinned(links: Links, sightings: Sightings, most: int) -> Mask:
-    """Keep about `most` links per frame, evenly over its pairs and within each in their order.
-
-    A pair keeps what the needier of its frames asks for.
-    """
-    count = np.bincount(links.edge)
-    pairs = np.flatnonzero(count)
-    first = (np.cumsum(count) - count)[pairs]
-    ends = np.stack([sightings.frame[links.a[first]], sightings.frame[links.b[first]]])
-    pairs_of_frame = np.bincount(ends.ravel())
-    quota = np.zeros(len(count), dtype=np.int64)
-    quota[pairs] = -(-most // pairs_of_frame[ends].min(axis=0))  # rounded up
-    quota, size = np.minimum(quota, count)[links.edge], count[links.edge]
-    within = np.arange(len(links)) - (np.cumsum(count) - count)[links.edge]
-    kept: Mask = (within + 1) * quota // size > within * quota // size
-    return kept
 
 
 def tracks(links: Links, sightings: Sightings) -> tuple[Integers, Integers]:
@@ -158,31 +141,26 @@ def tracks(links: Links, sightings: Sightings) -> tuple[Integers, Integers]:
     ones = np.ones(len(links), dtype=np.int8)
     graph = coo_matrix((ones, (links.a, links.b)), shape=(count, count))
     _, label = connected_components(graph, directed=False)
-    used = np.unique(np.concatenate([links.a, links.b]))
+    linked = np.zeros(count, dtype=np.bool_)
+    linked[links.a] = linked[links.b] = True
+    used = np.flatnonzero(linked)
     place = label[used].astype(np.int64) * (sightings.frame.max() + 1) + sightings.frame[used]
-    _, which, times = np.unique(place, return_inverse=True, return_counts=True)
-    used = used[times[which] == 1]
-    _, point, seen = np.unique(label[used], return_inverse=True, return_counts=True)
-    several = seen[point] > 1
-    _, renumbered = np.unique(point[several], return_inverse=True)
-    return used[several], renumbered
+    order = np.argsort(place, kind="stable")
+    same = np.diff(place[order]) == 0
+    twice = np.zeros(len(used), dtype=np.bool_)
+    twice[order[1:][same]] = twice[order[:-1][same]] = True
+    used = used[~twice]
+    several = np.bincount(label[used])[label[used]] > 1
+    return used[several], renumbered(label[used[several]])
 
 
-def sampled(
-    used: Integers, point: Integers, sightings: Sightings, most: int
-) -> tuple[Integers, Integers]:
-    """Keep some floor points whole, so that each frame has about `most` sightings or all it had.
-
-    A point is as likely kept as the neediest of its frames asks for.
-    """
-    frame = sightings.frame[used]
-    share = np.minimum(most / np.maximum(np.bincount(frame), 1), 1.0)
-    wanted = np.zeros(int(point.max()) + 1)
-    np.maximum.at(wanted, point, share[frame])
-    total = np.cumsum(wanted)
-    kept = np.floor(total + ROUNDING) > np.floor(total - wanted + ROUNDING)
-    inside = kept[point]
-    return used[inside], np.unique(point[inside], return_inverse=True)[1]
+def renumbered(number: Integers) -> Integers:
+    """Number the numbers that occur from 0 on, in their order."""
+    if len(number) == 0:
+        return number.astype(np.int64)
+    occurs = np.bincount(number) > 0
+    found: Integers = (np.cumsum(occurs) - 1)[number]
+    return found
 
 
 def single_links(links: Links) -> tuple[Integers, Integers]:

@@ -108,7 +108,10 @@ class TestTruth:
         ratio = []
         for seed in range(3):
             team = world(50 + seed, (Robot("A", path),), min_common=20)
-            tracks, links = solved(team), solved(team, BundleOptions(tracks=False))
+            tracks, links = (
+                solved(team, BundleOptions(tracks=joined, most_sightings=100_000))
+                for joined in (True, False)
+            )
             frame = FrameId("A", 3)
             heading = [found.team.covariance[frame][2, 2] for found in (tracks, links)]
             ratio.append(heading[0] / heading[1])
@@ -153,9 +156,8 @@ class TestSymmetries:
         found = solved(team)
         turned = [edge.reversed() for edge in reversed(team.edges)]
         again = solved(dataclasses.replace(team, edges=turned))
-        # The first stage thins by the order of edges and may cut other borderline links: a few
-        # of 8000, each worth 1 % of a pair's sigma of 0.2 mm.
-        same_poses(again.team.team_from_base, found.team.team_from_base, 2e-5)
+        # Sums are rounded otherwise, and a borderline link may be cut or not: one of 8000.
+        same_poses(again.team.team_from_base, found.team.team_from_base, 5e-6)
 
     def test_names_of_robots_do_not_matter(self):
         team = world(6)
@@ -178,7 +180,7 @@ class TestSymmetries:
         cameras = {"Z": team.cameras["A"], "B": team.cameras["B"]}
         again = bundle(start, edges, keyed(team.prior), keyed(team.sigma), cameras)
         assert isinstance(again, BundleEstimate)
-        same_poses(again.team.team_from_base, keyed(found.team.team_from_base), 2e-5)
+        same_poses(again.team.team_from_base, keyed(found.team.team_from_base), 5e-6)
 
     def test_the_reference_stays_and_has_no_covariance(self):
         team = world(7)
@@ -281,8 +283,7 @@ class TestWrongInput:
         found = solved(world(12, off), BundleOptions(distortion=Refine.IF_SEEN))
         for mount, true in zip(found.mounts, (0.01, -0.01), strict=True):
             assert mount.distortion.used
-            # To first order only: the sigma is 4 % of the value, so is the second order.
-            assert abs(mount.distortion.value - true) < 0.15 * abs(true)
+            assert abs(mount.distortion.value - true) < 4 * mount.distortion.sigma
 
     def test_odometry_ties_what_no_picture_ties(self):
         robots = (Robot("A", loop_path(13)), Robot("B", loop_path(5, (9.0, 9.0), (0.2, 0.2))))
@@ -454,7 +455,8 @@ class TestMessages:
         found = solved(dataclasses.replace(team, edges=edges))
         assert found.noise_factor == pytest.approx(3.0, rel=0.05)
         (text,) = texts(found, FindingKind.NOISE)
-        assert text.startswith("keypoint residuals are 3 times")
+        words = f"keypoint residuals are {found.noise_factor:.2g} times what their sigmas promise"
+        assert text == words
 
     def test_a_frame_without_a_prior_is_refused(self):
         team = world(25)

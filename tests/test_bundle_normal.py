@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from groundfuse.backend.bundle_kernel import Errors, Kernel, errors_of, noise_factor
 from groundfuse.backend.bundle_model import State, moved, residuals
 from groundfuse.backend.bundle_priors import (
     SCALE_GAUGE_SIGMA,
@@ -12,16 +13,7 @@ from groundfuse.backend.bundle_priors import (
     prior_cost,
     prior_residual,
 )
-from groundfuse.backend.bundle_solve import (
-    Errors,
-    Kernel,
-    errors_of,
-    minimise,
-    noise_factor,
-    problem_of,
-    step_from,
-    system_at,
-)
+from groundfuse.backend.bundle_solve import minimise, problem_of, step_from, system_at
 from groundfuse.backend.bundle_tracks import Sightings, observations
 from groundfuse.backend.measurement import Attitude, Se2
 from groundfuse.frontend.overhead import rays_from_floor
@@ -141,10 +133,10 @@ def dense_step(task, state, weight):
 )
 def test_a_step_is_the_dense_least_squares_step(seed, options):
     task, state = problem(seed, **options)
-    errors = errors_of(task, state)
-    kernel = Kernel(3.0, 1.0)
+    errors = errors_of(task.seen, state, task.priors.robot_of)
+    kernel = Kernel(3.0, 1.0, 1.0)
     system = system_at(task, state, errors, kernel, 0.0)
-    after, step = step_from(task, system, state, errors, kernel)
+    after, step, _ = step_from(task, system, state, errors, kernel)
     expected, points, _, _ = dense_step(task, state, kernel.weight(errors))
     scale = np.abs(expected).max()
     np.testing.assert_allclose(step, expected, atol=TOLERANCE * scale)
@@ -158,8 +150,8 @@ def test_a_step_is_the_dense_least_squares_step(seed, options):
 @pytest.mark.parametrize("relief", [0.0, 0.01])
 def test_the_reduced_system_is_the_schur_complement(relief):
     task, state = problem(5, relief=relief)
-    errors = errors_of(task, state)
-    kernel = Kernel(3.0, 1.0)
+    errors = errors_of(task.seen, state, task.priors.robot_of)
+    kernel = Kernel(3.0, 1.0, 1.0)
     reduced = system_at(task, state, errors, kernel, 0.0).reduced
     _, _, columns, free = dense_step(task, state, kernel.weight(errors))
     jacobian = np.stack(columns, axis=1)
@@ -192,11 +184,12 @@ def test_minimising_ends_where_the_gradient_vanishes():
     task, state = problem(8)
     solution = minimise(task, state, width=3.0, iterations=50, settled=1e-9)
     assert solution.settled
-    kernel = Kernel(3.0, solution.noise)
+    kernel = Kernel(3.0, solution.noise, solution.noise)
     system = system_at(task, solution.state, solution.errors, kernel, 0.0)
-    _, step = step_from(task, system, solution.state, solution.errors, kernel)
-    # One sigma of the best known unknown is 1e-4.
-    assert np.abs(step).max() < 1e-7
+    _, _, chi2 = step_from(task, system, solution.state, solution.errors, kernel)
+    # Derivatives of an earlier state are kept while steps shrink; what that leaves is far below
+    # one sigma of all unknowns together. Worst seen 1.2e-3.
+    assert chi2 < 0.01
 
 
 def test_a_start_far_away_ends_at_the_same_place():
@@ -208,18 +201,19 @@ def test_a_start_far_away_ends_at_the_same_place():
     nudge[:NUM_FRAMES][task.priors.fixed, :3] = 0.0
     away = moved(state, nudge, rng.normal(0, 0.1, (NUM_POINTS, 2)))
     far = minimise(task, away, width=3.0, iterations=60, settled=1e-9)
-    np.testing.assert_allclose(far.state.pose, near.state.pose, atol=1e-6)
+    # Kept derivatives leave a few hundredths of a sigma, which is 1 mm here; worst seen 3e-5.
+    np.testing.assert_allclose(far.state.pose, near.state.pose, atol=1e-4)
 
 
 def test_the_kernel_weighs_down_and_never_up():
     chi2 = np.array([0.0, 9.0, 81.0, 1e9])
     unseen = np.array([False, False, False, True])
     errors = Errors(np.zeros((4, 2)), unseen, chi2)
-    np.testing.assert_allclose(Kernel(3.0, 1.0).weight(errors), [1.0, 0.5, 0.1, 0.0])
-    np.testing.assert_allclose(Kernel(3.0, 3.0).weight(errors)[1], 0.9)
+    np.testing.assert_allclose(Kernel(3.0, 1.0, 1.0).weight(errors), [1.0, 0.5, 0.1, 0.0])
+    np.testing.assert_allclose(Kernel(3.0, 3.0, 3.0).weight(errors)[1], 0.9)
     # The cost's derivative by chi-square is the weight.
     more = Errors(np.zeros((4, 2)), unseen, chi2 + np.array([0.0, 1e-4, 0.0, 0.0]))
-    slope = (Kernel(3.0, 1.0).cost(more) - Kernel(3.0, 1.0).cost(errors)) / 1e-4
+    slope = (Kernel(3.0, 1.0, 1.0).cost(more) - Kernel(3.0, 1.0, 1.0).cost(errors)) / 1e-4
     np.testing.assert_allclose(slope, 0.5, rtol=1e-3)
 
 

@@ -12,10 +12,8 @@ from groundfuse.backend.bundle_tracks import (
     Sightings,
     observations,
     pieces,
-    sampled,
     sightings_from_edges,
     single_links,
-    thinned,
     tracks,
 )
 from groundfuse.backend.measurement import Correspondences, FrameId, RelativePose, Se2
@@ -96,24 +94,6 @@ def test_a_point_seen_twice_by_a_frame_loses_those_sightings():
     assert joined(edge(1, 2, [1, 1], [5, 6]), edge(0, 3, [2], [2])) == [[(0, 2), (3, 2)]]
 
 
-@given(st.integers(1, 30), st.lists(st.integers(1, 90), min_size=1, max_size=6))
-def test_thinning_spreads_over_pairs(most, sizes):
-    frame = np.array([0, *range(1, len(sizes) + 1)])
-    sightings = Sightings(frame, np.zeros((len(frame), 2)), np.ones(len(frame)))
-    number = np.repeat(np.arange(len(sizes)), sizes)
-    links = Links(np.zeros(len(number), dtype=np.int64), number + 1, number)
-    kept = np.bincount(number[thinned(links, sightings, most)], minlength=len(sizes))
-    # Every second frame has one pair only and asks for `most` of it.
-    assert kept.tolist() == [min(size, most) for size in sizes]
-
-
-def test_a_frame_of_many_pairs_takes_part_of_each():
-    sightings = Sightings(np.array([0, 1, 2]), np.zeros((3, 2)), np.ones(3))
-    number = np.repeat([0, 1, 2], 50)
-    links = Links(np.array([0, 0, 1])[number], np.array([1, 2, 2])[number], number)
-    assert np.bincount(number[thinned(links, sightings, 40)]).tolist() == [20, 20, 20]
-
-
 @given(st.integers(1, 6), st.integers(0, 40), st.integers(0, 99))
 def test_observations_list_every_pair_once(num_frames, num_points, seed):
     rng = np.random.default_rng(seed)
@@ -143,27 +123,6 @@ def test_observations_list_every_pair_once(num_frames, num_points, seed):
             got.append((int(seen.frame[i]), int(seen.frame[j]), int(seen.point[i])))
     assert len(got) == len(expected)
     assert set(got) == expected
-
-
-@given(st.integers(2, 8), st.integers(1, 60), st.integers(1, 30), st.integers(0, 99))
-def test_a_sample_keeps_points_whole_and_frames_rich(num_frames, num_points, most, seed):
-    rng = np.random.default_rng(seed)
-    frame, point = np.nonzero(rng.random((num_frames, num_points)) < 0.5)
-    sightings = Sightings(frame, np.zeros((len(frame), 2)), np.ones(len(frame)))
-    if len(frame) == 0:
-        return
-    _, point = np.unique(point, return_inverse=True)
-    used, number = sampled(np.arange(len(frame)), point, sightings, most)
-    kept = set(point[used].tolist())
-    assert len(used) == np.isin(point, list(kept)).sum()  # all sightings of a kept point
-    assert number.max() + 1 == len(kept)
-    assert len(set(zip(number.tolist(), point[used].tolist(), strict=True))) == len(kept)
-    before, after = np.bincount(frame), np.bincount(frame[used], minlength=len(np.bincount(frame)))
-    if (before <= most).all():
-        assert len(used) == len(frame)
-    # A frame's points are kept with at least its own share each; rounding of the running total
-    # takes at most one, and neighbours of other shares move it by a few.
-    assert (after >= np.minimum(before, most) / 2 - 3).all()
 
 
 def test_single_links_share_nothing():
