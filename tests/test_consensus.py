@@ -14,6 +14,8 @@ from groundfuse.frontend.consensus import (
     Candidates,
     ConsensusOptions,
     Gate,
+    _apart,
+    _coefficients,
     _drawn,
     _procrustes,
     find_modes,
@@ -23,6 +25,7 @@ from groundfuse.frontend.consensus import (
 TOLERANCE_M = 0.01
 OPTIONS = ConsensusOptions(num_draws=8000)
 TRUTH = Se2(0.3, -0.2, 2.0)
+poses = st.builds(Se2, st.floats(-2, 2), st.floats(-2, 2), st.floats(-math.pi, math.pi))
 
 
 def planted(rng, motions=(TRUTH,), right=40, wrong=120, scale=1.0, noise_m=0.0015, size_m=0.4):
@@ -69,7 +72,7 @@ def assert_near(mode, truth):
 
 
 @given(
-    st.builds(Se2, st.floats(-2, 2), st.floats(-2, 2), st.floats(-math.pi, math.pi)),
+    poses,
     st.integers(0, 2**16),
     st.booleans(),
 )
@@ -89,6 +92,16 @@ def test_the_planted_motion_is_found(truth, seed, turned):
     assert all(rival.votes < 0.4 * best.votes for rival in rivals)
 
 
+@given(poses, poses, st.floats(-2, 2), st.floats(-2, 2))
+def test_motions_are_compared_at_the_view(one, other, x, y):
+    centre = np.array([x, y])
+    place, turn = _apart(_coefficients(one)[None], _coefficients(other), centre)
+    moved = one.apply(centre[None]) - other.apply(centre[None])
+    assert place[0] == pytest.approx(np.hypot(*moved[0]), abs=1e-12)
+    between = abs((one.inverse() @ other).theta_rad)
+    assert turn[0] == pytest.approx(between, abs=1e-12)
+
+
 @pytest.mark.parametrize("scale", [1.0, 1.15, 0.9])
 def test_every_draw_from_exact_matches_is_the_motion(scale):
     """Without noise or wrong candidates; nearly all pairs of points are long enough."""
@@ -102,7 +115,7 @@ def test_every_draw_from_exact_matches_is_the_motion(scale):
 
 
 @given(
-    st.builds(Se2, st.floats(-2, 2), st.floats(-2, 2), st.floats(-math.pi, math.pi)),
+    poses,
     st.floats(0.8, 1.25),
     st.integers(0, 2**16),
 )

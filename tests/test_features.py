@@ -253,6 +253,7 @@ def test_the_frame_counts_not_the_mount():
     apart, _ = cKDTree(DOTS).query(found.floor_m)
     assert np.median(apart[apart < 1.5 * DOT_M]) < 0.4e-3
     assert found.height_m == 0.6
+    np.testing.assert_allclose(rays_from_floor(leaning, found.floor_m), found.rays, atol=1e-12)
 
 
 def test_features_cross_processes():

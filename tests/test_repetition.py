@@ -35,6 +35,14 @@ def test_noise_does_not_repeat(seed):
     assert repetition(white(seed), WHOLE) < 0.1
 
 
+def test_a_view_that_is_livelier_on_one_side_is_judged_alike():
+    """Contrast that grows twentyfold across the view: shares of the overlap's own power."""
+    ramp = np.exp(np.linspace(0.0, np.log(20.0), 160)).astype(np.float32)
+    assert repetition(tiled(30, 40) * ramp, WHOLE) > 0.99
+    # Fewer pixels carry the power; worst seen of four seeds 0.07.
+    assert repetition(white(5) * ramp, WHOLE) < 0.12
+
+
 def test_noise_on_the_tiles_lowers_the_peak_by_its_share():
     """Signal of variance 1 in noise of variance 0.25: correlation 0.8."""
     picture = tiled(30, 40) + 0.5 * white(1)
