@@ -657,6 +657,23 @@ def test_wrong_files_are_named(team, tmp_path):
     assert not out.exists()
 
 
+def test_a_camera_that_resolves_no_floor_is_refused_before_any_work(team, tmp_path):
+    """A long lens that once looks far ahead, though not over the horizon."""
+    text = (team / "A" / "camera.yaml").read_text()
+    camera(team, "190.0", "1900.0")
+    camera(team, "191.0", "1900.0")
+    frames = team / "A" / "frames.csv"
+    frames.write_text("image,tilt_deg\nimg_00.png,33\nimg_01.png,85\n")
+    line = refused(run(team, tmp_path / "out", "--robots", "A"))
+    assert line.startswith("robot A, tilt 85 deg, height 0.55 m: no floor is resolved: a pixel ")
+    frames.unlink()
+    (team / "A" / "camera.yaml").write_text(text)
+    wide = ("--set", "front_end.features.overhead.max_cells=100")
+    line = refused(run(team, tmp_path / "out", *wide))
+    assert line.startswith("robot A, tilt 33 deg, height 0.55 m: overhead view of ")
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_picture_that_is_cut_short_is_named(team, tmp_path):
     path = team / "B" / "images" / "img_01.png"
     path.write_bytes(path.read_bytes()[:5000])

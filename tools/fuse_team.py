@@ -25,6 +25,7 @@ from groundfuse.tools.closing_table import closing_table
 from groundfuse.tools.drift_table import drift_record
 from groundfuse.tools.errors import TeamError
 from groundfuse.tools.files import make_folder, write_atomic
+from groundfuse.tools.floor_check import check_floor
 from groundfuse.tools.front_end import Matcher, Result, with_matcher
 from groundfuse.tools.open3d_check import check_with_open3d
 from groundfuse.tools.outputs import (
@@ -145,6 +146,7 @@ def run(asked: argparse.Namespace) -> Fused:
     with watch.stage("reading"):
         robots = read_team(asked.team, asked.robots or list_robots(asked.team))
         check_names(robot.name for robot in robots)
+        check_floor(robots, options.front_end.features.overhead)
         out = make_folder(asked.out)
         write_json(out / "options.json", record(options))
     bar = _Bar(asked.quiet)
