@@ -227,13 +227,15 @@ def test_the_jacobian_is_the_slope_of_the_residual(cameras):
         )
 
     jacobian = linearised(np.zeros(11))[1]
-    step = np.array([1e-3] * 3 + [1e-3, 1e-3, 1e-3] * 2 + [0.01, 0.01])
+    # A pixel or two: OpenCV 4 reads between pixels in steps of 1/32.
+    step = np.array([4e-3] * 9 + [0.01, 0.01])
     for k in range(11):
         change = step[k] * np.eye(11)[k]
         numeric = (linearised(change)[0] - linearised(-change)[0]) / (2 * step[k])
         scale = np.sqrt(np.mean(jacobian[:, k] ** 2))
-        # Slopes come from a 3 x 3 kernel on a picture of 6 px blur: a few per cent low.
-        assert np.sqrt(np.mean((numeric - jacobian[:, k]) ** 2)) < 0.08 * scale, k
+        # Slopes come from a 3 x 3 kernel on a picture of 6 px blur, differences from 3 px and more;
+        # worst seen 2.4 %.
+        assert np.sqrt(np.mean((numeric - jacobian[:, k]) ** 2)) < 0.06 * scale, k
 
 
 def test_the_priors_hold_what_the_pictures_do_not_show():
