@@ -175,6 +175,15 @@ def test_a_gate_below_half_the_period_makes_tiles_unique():
         assert np.hypot(*error[:2]) < 0.005
 
 
+def test_matches_carry_each_features_own_ray_and_sigma():
+    found = matched(PLAIN).correspondences
+    sides = (found.rays_a, found.sigma_a), (found.rays_b, found.sigma_b)
+    for frame, (rays, sigma) in zip(PLAIN, sides, strict=True):
+        features = features_of(frame, FeatureOptions())
+        known = {tuple(r): s for r, s in zip(features.rays, features.sigma, strict=True)}
+        assert [known[tuple(r)] for r in rays] == list(sigma)
+
+
 def test_the_same_seed_gives_the_same_matches():
     one, two = matched(PLAIN, seed=5), matched(PLAIN, seed=5)
     np.testing.assert_array_equal(one.correspondences.rays_a, two.correspondences.rays_a)
