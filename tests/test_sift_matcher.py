@@ -217,8 +217,8 @@ def test_candidates_are_the_nearest_descriptors_of_like_size(kind):
         mine = found.index_a == i
         third = np.sort(apart)[2]
         assert (apart[found.index_b[mine]] <= third + 1e-3).all()
-        ranked = np.zeros(len(b), int)
-        ranked[found.index_b[mine]] = found.rank[mine]
+        assert set(found.rank[mine]) <= {0, 1, 2}
+        assert len(set(found.rank[mine])) == mine.sum()
         order = apart[found.index_b[mine]]
         assert (np.diff(order[np.argsort(found.rank[mine])]) >= -1e-3).all()
         alike = np.abs(a.log_size[i] - b.log_size) < options.max_log_size
