@@ -108,13 +108,13 @@ def team(folder):
     return robot("A", folder), robot("B", folder)
 
 
-TITLES: list[str] = []
+STAGES: list[tuple[str, int]] = []
 
 
 @pytest.fixture(scope="module")
 def found(team) -> FrontEndResult:
     def recorded(items, total, title):
-        TITLES.append(f"{title} {total}")
+        STAGES.append((title, total))
         return items
 
     return run(team, progress=recorded)
@@ -172,6 +172,8 @@ def test_a_skip_is_tried_only_where_the_chain_is_cut(team):
 def test_every_pair_ends_once_and_in_order(found):
     pairs = [(r.a, r.b) for r in found.edges] + [(r.a, r.b) for r in found.rejected]
     assert len(pairs) == len(set(pairs))
+    assert STAGES[0] == ("features", len(shots()))
+    assert sum(total for _, total in STAGES[1:]) == len(pairs)  # none is tried twice
     assert all(a < b for a, b in pairs)
     for part in (found.edges, found.rejected):
         assert [(r.a, r.b) for r in part] == sorted((r.a, r.b) for r in part)
@@ -366,10 +368,11 @@ def test_odometry_finer_than_the_wobble_does_no_harm(i, j):
     assert isinstance(result, RelativePose)
 
 
-@pytest.mark.parametrize("tilt_deg", [0.0, 33.0])
-def test_the_gate_grows_by_what_wobble_does_to_the_middle_of_the_views(tilt_deg):
+@pytest.mark.parametrize("sigma", [(0.03, 1e-4, 1e-4), (1e-4, 0.03, 1e-4), (1e-4, 1e-4, 0.03)])
+@pytest.mark.parametrize("tilt_deg", [10.0, 45.0])
+def test_the_gate_grows_by_what_wobble_does_to_the_middle_of_the_views(tilt_deg, sigma):
     """Four root mean squares of both views' drawn shifts."""
-    cam = camera(tilt_deg, sigma=Attitude(0.01, 0.02, 0.02))
+    cam = camera(tilt_deg, sigma=Attitude(*sigma))
     frame = Frame(FrameId("A", 0), Path(), 0.0, cam.mount.attitude, cam.mount.sigma)
     seen = Seen(frame, Robot("A", cam, (frame,)), None, None, None)
     rng = np.random.default_rng(22)
@@ -379,8 +382,8 @@ def test_the_gate_grows_by_what_wobble_does_to_the_middle_of_the_views(tilt_deg)
     shifts = [floor_from_rays(drawn(known, rng), axis) - still for _ in range(400)]
     both = 2.0 * np.mean(np.square(shifts).sum(axis=2))
     wide = _swayed(Gate(Se2(0.1, 0.2, 0.3), 0.05, 0.07), seen, seen, OPTIONS)
-    # A mean square of 400 draws of three numbers: 6 %.
-    assert wide.radius_m**2 - 0.05**2 == pytest.approx(16.0 * both, rel=0.2)
+    # A mean square of 400 draws: 7 %.
+    assert wide.radius_m**2 - 0.05**2 == pytest.approx(16.0 * both, rel=0.3)
     assert (wide.a_from_b, wide.turn_rad) == (Se2(0.1, 0.2, 0.3), 0.07)
 
 

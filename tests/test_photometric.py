@@ -135,6 +135,37 @@ def test_views_of_very_different_resolution_share_no_points():
     assert num_points("nadir", 1.05) == num_points("nadir", 3.0)
 
 
+def test_a_finer_and_a_coarser_view_are_left_out_alike():
+    """From twice the height everything is half as large, whichever of the two is a."""
+    low, high = (
+        photo(camera(0.0, h), Se2(0.0, 0.0, 0.2), frame=FrameId(name, 30), grain_m=0.55)
+        for h, name in ((0.4, "A"), (0.8, "B"))
+    )
+    strict = dataclasses.replace(OPTIONS, max_stretch=1.7)
+    for pair in ((low, high), (high, low)):
+        assert aligned(pair, options=strict) is None
+        assert aligned(pair).num_points > OPTIONS.min_points
+
+
+def test_points_are_the_steepest_of_their_cells():
+    frame = pair_of(CAMERAS["alike"])[0]
+    grey = prepared(frame)
+    blurred = photometric._blurred(grey, 1.5)
+    attitude = np.tile(photometric._vector(frame.attitude), 2)
+    points = photometric._points(blurred, grey, grey, IDENTITY, attitude, OPTIONS).astype(int)
+    by_v, by_u = np.gradient(blurred)
+    steep = np.hypot(by_u, by_v)
+    assert len(points) > 800
+    cells = points // OPTIONS.cell_px
+    assert len(set(map(tuple, cells))) == len(points)
+    rank = []
+    for (u, v), (column, row) in zip(points, cells * OPTIONS.cell_px, strict=True):
+        cell = steep[row : row + OPTIONS.cell_px, column : column + OPTIONS.cell_px]
+        rank.append((cell > steep[v, u]).sum())
+    # Of 81 pixels; another kernel for the slope may prefer a neighbour.
+    assert np.mean(rank) < 2.0
+
+
 def test_pictures_that_do_not_fit_say_so():
     """A wrong start far off: the residual is that of any two pictures."""
     limit = OPTIONS.max_residual
