@@ -23,10 +23,7 @@ from groundfuse.backend.bundle_estimate import (
 )
 from groundfuse.backend.bundle_files import (
     FileTest,
-    as_filed,
-    contradicted,
-    files_test,
-    freed_priors,
+    settled_files,
     with_better_files,
 )
 from groundfuse.backend.bundle_model import State
@@ -152,9 +149,8 @@ def _solved(
     first = _stage(job, clean, priors, state, single_links(clean.links.only(thin)), START)
     if isinstance(first, BundleRefusal):
         return first
-    _, rough = first
-    free = contradicted(files_test(*first, options), priors, options)
-    priors, state = freed_priors(priors, free), as_filed(rough.state, free)
+    # Right correspondences contradict a wrong file: free its numbers before any of them are cut.
+    priors, rough, state = settled_files(*first, options, START.settled)
     clean = _cleaned(job, priors, rough, state)
     joined = _joined(job, clean)
     num_frames = len(job.team.frames)

@@ -48,7 +48,7 @@ class BundleOptions:
     """Sightings in the trial whether the floor is flat; a frame keeps 60 at least."""
     start_sightings: int = 250
     """Correspondences per frame in the first stage, which is robust against single wrong ones."""
-    robust_sigma: float = 3.0
+    robust_sigma: float = 1.5
     """Width of the Cauchy kernel on a whitened ray residual, sigmas."""
     link_gate_sigma: float = 4.0
     """A correspondence whose two floor points lie further apart than this is wrong, sigmas."""

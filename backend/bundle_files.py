@@ -110,6 +110,36 @@ def as_filed(state: State, free: Mask) -> State:
     return State(state.pose, state.attitude, shared, state.point)
 
 
+def settled_files(
+    problem: Problem, solution: Solution, options: BundleOptions, settled: float
+) -> tuple[Priors, Solution, State]:
+    """Keep free only what the pictures contradict: the priors, a solution and its state for them.
+
+    The problem has all mounts free and no lens. Numbers that are contradicted and were not free
+    are solved for, because the residuals of a wrong lens look like wrong correspondences.
+    """
+    priors = problem.priors
+    free = contradicted(files_test(problem, solution, options), priors, options)
+    fewer = freed_priors(priors, free)
+    if free[:, LENS].any():
+        solution = _solved(replace(problem, priors=fewer), solution, options, settled)
+    return fewer, solution, as_filed(solution.state, free)
+
+
+def _solved(
+    problem: Problem, solution: Solution, options: BundleOptions, settled: float
+) -> Solution:
+    """Go on from a solution with other priors."""
+    return minimise(
+        problem,
+        solution.state,
+        width=options.robust_sigma,
+        iterations=options.iterations,
+        settled=settled,
+        noise=solution.noise,
+    )
+
+
 def with_better_files(
     problem: Problem, solution: Solution, options: BundleOptions, settled: float
 ) -> tuple[Problem, Solution, FileTest]:
@@ -121,12 +151,5 @@ def with_better_files(
     if (free == already).all():
         return problem, solution, test
     problem = replace(problem, priors=freed_priors(priors, free))
-    solution = minimise(
-        problem,
-        solution.state,
-        width=options.robust_sigma,
-        iterations=options.iterations,
-        settled=settled,
-        noise=solution.noise,
-    )
+    solution = _solved(problem, solution, options, settled)
     return problem, solution, files_test(problem, solution, options)

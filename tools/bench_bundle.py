@@ -6,9 +6,10 @@
     bench_bundle.py --teams 0 --real out/real/seneca out/real/planar_mosaic
 
 Rendered and real teams go through the whole front-end and the Pose2 graph first. Errors are root
-mean square positions after the best rigid alignment and, behind the slash, the best similarity:
-scale comes from the camera heights alone, and the mean of n heights that wobble by 0.36 % is known
-to 0.36 % / sqrt(n) whatever the method. Seeds from 900 on were not used while building.
+mean square positions of the cameras' feet after the best rigid alignment and, behind the slash, the
+best similarity: scale comes from the camera heights alone, and the mean of n heights that wobble by
+0.36 % is known to 0.36 % / sqrt(n) whatever the method. NEES likewise, as it is and at true scale.
+Seeds from 900 on were not used while building.
 """
 
 import argparse
@@ -26,13 +27,13 @@ import cv2
 import numpy as np
 
 from groundfuse.backend.bundle import bundle
-from groundfuse.backend.bundle_estimate import BundleOptions, BundleRefusal
+from groundfuse.backend.bundle_estimate import BundleRefusal
 from groundfuse.tools import render_team
 from groundfuse.tools.bench_bundle_teams import (
     FILES,
     Measured,
     averages,
-    matched,
+    fused,
     measured,
     with_files,
 )
@@ -46,7 +47,7 @@ from groundfuse.tools.world import Scene
 
 HEAD = (
     f"{'team':<22}{'frames':>7}{'pairs':>7}{'Pose2 mm':>16}{'bundle mm':>16}{'% path':>9}"
-    f"{'NEES':>7}{'px':>7}{'noise':>7}{'relief':>8}{'s':>7}"
+    f"{'NEES':>13}{'px':>7}{'noise':>7}{'relief':>8}{'s':>7}"
 )
 
 
@@ -64,9 +65,10 @@ def rendered(
 def row(name: str, found: Measured) -> str:
     """Format one line of the table."""
     pose2, after = (f"{rigid * 1e3:.3f}/{similar * 1e3:.3f}" for rigid, similar in found.errors_m)
+    nees = "/".join(f"{value:.2f}" for value in found.nees)
     return (
         f"{name:<22}{found.num_frames:7d}{found.num_pairs:7d}{pose2:>16}{after:>16}"
-        f"{100.0 * found.errors_m[1][0] / found.path_m:9.4f}{found.nees:7.2f}"
+        f"{100.0 * found.errors_m[1][0] / found.path_m:9.4f}{nees:>13}"
         f"{found.residual_px:7.3f}{found.noise:7.2f}{found.relief:8.2f}{found.seconds:7.2f}"
     )
 
@@ -80,8 +82,8 @@ def bench_teams(floor: str, seeds: Sequence[int], num_workers: int) -> None:
         with tempfile.TemporaryDirectory() as folder:
             robots, scene = rendered(Path(folder) / "team", floor, seed)
             for files, change in FILES.items():
-                team = matched(with_files(robots, change), num_workers)
-                found, bundled = measured(team, BundleOptions())
+                team, seconds = fused(with_files(robots, change), num_workers)
+                found, bundled = measured(team, seconds)
                 every.setdefault(files, []).append(found)
                 print(row(f"{floor} {seed} {files}", found), flush=True)
                 if files == "as filed":
@@ -102,7 +104,7 @@ def bench_large(floor: str, seeds: Sequence[int], num_workers: int) -> None:
         with tempfile.TemporaryDirectory() as folder:
             words = ["--views", "200", "--step", "0.2"]
             robots, _ = rendered(Path(folder) / "team", floor, seed, words)
-            found, bundled = measured(matched(robots, num_workers), BundleOptions())
+            found, bundled = measured(*fused(robots, num_workers))
         print(row(f"{floor} {seed} 2 x 200", found), flush=True)
         for finding in bundled.findings:
             print(f"  {finding.text}")
@@ -145,8 +147,7 @@ def bench_real(folders: Sequence[Path], num_workers: int) -> None:
     """Print real teams against their reference poses."""
     print(HEAD)
     for folder in folders:
-        team = matched(read_team(folder, list_robots(folder)), num_workers)
-        found, bundled = measured(team, BundleOptions())
+        found, bundled = measured(*fused(read_team(folder, list_robots(folder)), num_workers))
         print(row(folder.name, found), flush=True)
         for finding in bundled.findings:
             print(f"  {finding.text}")

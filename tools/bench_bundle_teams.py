@@ -1,20 +1,12 @@
 """Teams for the bundle's bench: matched once, bundled and scored against their truth."""
 
 import math
-import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
-from groundfuse.backend.bundle import bundle
-from groundfuse.backend.bundle_estimate import (
-    BundleCamera,
-    BundleEstimate,
-    BundleOptions,
-    BundleRefusal,
-)
+from groundfuse.backend.bundle_estimate import BundleEstimate
 from groundfuse.backend.drift import accuracy
 from groundfuse.backend.measurement import Attitude, FrameId, Se2, TeamEstimate
 from groundfuse.frontend.camera import Camera
@@ -58,7 +50,8 @@ class Measured:
         num_pairs: accepted pairs.
         path_m: true length of the ways.
         errors_m: of the Pose2 graph and of the bundle: rigid and similarity alignment.
-        nees: mean over poses, relative to the reference frame; nan where its truth is unknown.
+        nees: mean over poses, relative to the reference frame, as they are and at the true scale;
+            nan where the reference's truth is unknown.
         residual_px: root mean square reprojection residual.
         noise: residuals over their promise.
         relief: that was allowed for.
@@ -69,7 +62,7 @@ class Measured:
     num_pairs: int
     path_m: float
     errors_m: tuple[tuple[float, float], tuple[float, float]]
-    nees: float
+    nees: tuple[float, float]
     residual_px: float
     noise: float
     relief: float
@@ -88,7 +81,7 @@ def averages(some: Sequence[Measured]) -> Measured:
         round(mean(found.num_pairs for found in some)),
         mean(found.path_m for found in some),
         ((errors[0][0], errors[0][1]), (errors[1][0], errors[1][1])),
-        mean(found.nees for found in some),
+        (mean(found.nees[0] for found in some), mean(found.nees[1] for found in some)),
         mean(found.residual_px for found in some),
         mean(found.noise for found in some),
         mean(found.relief for found in some),
@@ -127,51 +120,39 @@ def _quiet(items: Iterable[Result], total: int, title: str) -> Iterable[Result]:
     return items
 
 
-def matched(robots: Sequence[Robot], num_workers: int) -> Fused:
-    """Run the front-end and the Pose2 graph."""
-    return fuse_robots(robots, PipelineOptions(), num_workers, _quiet, Stopwatch(), bundled=False)
+def fused(robots: Sequence[Robot], num_workers: int) -> tuple[Fused, float]:
+    """Run the whole main job; with the seconds of its bundle."""
+    watch = Stopwatch()
+    team = fuse_robots(robots, PipelineOptions(), num_workers, _quiet, watch)
+    return team, watch.seconds["bundle"]
 
 
-def inputs(team: Fused) -> tuple[Any, ...]:
-    """Return the bundle's arguments."""
-    known = {frame: found for frame, (_, found) in team.frames.items()}
-    cameras = {
-        robot.name: BundleCamera(
-            robot.camera.mount.base_from_foot, robot.camera.intrinsics.focal_px
-        )
-        for robot in team.robots
-    }
-    return (
-        team.team,
-        accepted_edges(team.team, team.edges),
-        {frame: found.attitude for frame, found in known.items()},
-        {frame: found.sigma for frame, found in known.items()},
-        cameras,
-    )
+def measured(team: Fused, seconds: float) -> tuple[Measured, BundleEstimate]:
+    """Score the largest component; `seconds` were spent on the bundle.
 
-
-def measured(team: Fused, options: BundleOptions) -> tuple[Measured, BundleEstimate]:
-    """Bundle and score the largest component.
+    Positions are those of the cameras' feet: what stands between a camera and its robot's base does
+    not stretch with the map, so bases would show a wrong scale even after a similarity.
 
     Raises:
-        TeamError: the bundle refuses, or there is no truth to score against.
+        TeamError: the bundle refused, or there is no truth to score against.
     """
-    start, edges, prior, sigma, cameras = inputs(team)
-    begin = time.perf_counter()
-    found = bundle(start, edges, prior, sigma, cameras, options)
-    seconds = time.perf_counter() - begin
-    if isinstance(found, BundleRefusal):
-        raise TeamError(f"no bundle ({found.reason.value}): {found.text}")
+    found = team.bundled
+    if not isinstance(found, BundleEstimate):
+        raise TeamError(f"no bundle: {found.text if found else 'not asked for'}")
+    feet = {robot.name: robot.camera.mount.base_from_foot for robot in team.robots}
     truth = {frame: pose for robot in team.robots for frame, pose in (robot.truth or {}).items()}
-    before, after = (accuracy(_largest(some), truth) for some in (team.team, found.team))
+    true_feet = _at_feet(truth, feet)
+    before, after = (
+        accuracy(_at_feet(_largest(some), feet), true_feet) for some in (team.team, found.team)
+    )
     if before is None or after is None:
         raise TeamError("a bench needs true poses of at least two frames")
     figures = Measured(
         after.num_frames,
-        len(edges),
+        len(accepted_edges(team.team, team.edges)),
         after.path_m,
         ((before.ate_m, before.ate_scaled_m), (after.ate_m, after.ate_scaled_m)),
-        mean_nees(found.team, truth),
+        (mean_nees(found.team, truth, feet, 1.0), mean_nees(found.team, truth, feet, after.scale)),
         found.residual_px,
         found.noise_factor,
         found.relief,
@@ -180,19 +161,33 @@ def measured(team: Fused, options: BundleOptions) -> tuple[Measured, BundleEstim
     return figures, found
 
 
+def _at_feet(poses: Mapping[FrameId, Se2], feet: Mapping[str, Se2]) -> dict[FrameId, Se2]:
+    return {frame: pose @ feet[frame.robot] for frame, pose in poses.items()}
+
+
 def _largest(team: TeamEstimate) -> dict[FrameId, Se2]:
     return {f: pose for f, pose in team.team_from_base.items() if team.component_of[f] == 0}
 
 
-def mean_nees(team: TeamEstimate, truth: Mapping[FrameId, Se2]) -> float:
-    """Mean normalised squared error of poses relative to the reference; nan without its truth."""
-    poses = _largest(team)
+def mean_nees(
+    team: TeamEstimate, truth: Mapping[FrameId, Se2], feet: Mapping[str, Se2], scale: float
+) -> float:
+    """Mean normalised squared error of poses relative to the reference; nan without its truth.
+
+    `scale` stretches the estimate first: the covariances know of the heights' wobble, but not of a
+    file whose height is wrong.
+    """
+    poses = _at_feet(_largest(team), feet)
     reference = next(f for f in sorted(poses) if f not in team.covariance)
     if reference not in truth:
         return math.nan
-    team_from_world = poses[reference] @ truth[reference].inverse()
+    true = _at_feet(truth, feet)
     values = []
     for frame in sorted(set(poses) & set(truth) & set(team.covariance)):
-        error = ((team_from_world @ truth[frame]).inverse() @ poses[frame]).vector()
-        values.append(float(error @ np.linalg.solve(team.covariance[frame], error)))
+        seen = poses[reference].inverse() @ poses[frame]
+        seen = Se2(scale * seen.x_m, scale * seen.y_m, seen.theta_rad)
+        error = (true[frame].inverse() @ true[reference] @ seen).vector()
+        by_foot = feet[frame.robot].inverse().adjoint()
+        covariance = by_foot @ team.covariance[frame] @ by_foot.T
+        values.append(float(error @ np.linalg.solve(covariance, error)))
     return float(np.mean(values)) if values else math.nan
