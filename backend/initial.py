@@ -1,15 +1,19 @@
 """Starts for planar pose graphs: chordal relaxation with full covariances, and a spanning tree.
 
-The chordal start needs no guess: rotations as free complex numbers (linear least squares) put back
-on the unit circle, then translations with the rotations held. Carlone et al., "Initialization
-techniques for 3D SLAM" (2015); Martinec and Pajdla (2007).
+The chordal start needs no guess: headings as free complex numbers (linear least squares) put back
+on the unit circle, then positions and small turns together in one linear solution. Martinec and
+Pajdla (2007); Carlone et al., "A linear approximation for graph-based SLAM" (2011) and
+"Initialization techniques for 3D SLAM" (2015).
 """
 
-import numpy as np
+from typing import NamedTuple
 
-from groundfuse.backend import planar, sparse
+import numpy as np
+from scipy.sparse.linalg import SuperLU
+
+from groundfuse.backend import normal, planar, sparse
 from groundfuse.backend.chain import spanning_forest
-from groundfuse.backend.problem import Array, Indices, Problem, components
+from groundfuse.backend.problem import Array, Indices, Linear, Problem, components
 
 
 def held_poses(problem: Problem) -> Indices:
@@ -23,16 +27,30 @@ def layout_of(problem: Problem) -> sparse.Pattern:
     return sparse.pattern(problem.num_poses, problem.a, problem.b, held_poses(problem))
 
 
-def chordal(problem: Problem, layout: sparse.Pattern) -> Array:
-    """Return (n, 3) poses with the held ones at the origin.
+class Start(NamedTuple):
+    """Poses (n, 3) and the factor of their normal equations (None where nothing is free)."""
+
+    poses: Array
+    factor: SuperLU | None
+
+
+def chordal(problem: Problem, layout: sparse.Pattern, fill: sparse.Filling | None = None) -> Start:
+    """Return the chordal start; `fill` is that of 3 x 3 blocks.
 
     Raises:
         RuntimeError: the system is singular (not reached where every part has one held pose).
     """
+    if not layout.size:
+        return Start(np.zeros((problem.num_poses, 3)), None)
     covariance = planar.inverted(problem.information)
     theta_rad = _rotations(problem, layout, 1.0 / covariance[:, 2, 2])
-    position_m = _translations(problem, layout, theta_rad, covariance[:, :2, :2])
-    return np.column_stack([position_m, theta_rad])
+    linear = _about_headings(problem, theta_rad)
+    matrix, gradient = normal.of_linear(linear, problem.information, layout, fill)
+    factor = sparse.factorised(matrix)
+    step = sparse.spread(layout, factor.solve(-gradient.ravel()).reshape(-1, 3))
+    place_m = planar.rotated(step[:, :2], theta_rad)
+    poses = np.column_stack([place_m, planar.wrapped(theta_rad + step[:, 2])])
+    return Start(poses, factor)
 
 
 def _rotations(problem: Problem, layout: sparse.Pattern, weight: Array) -> Array:
@@ -49,27 +67,23 @@ def _rotations(problem: Problem, layout: sparse.Pattern, weight: Array) -> Array
         np.where(b_held, weight * turn.conj(), 0.0),
         np.where(a_held, weight * turn, 0.0),
     )
-    if not layout.size:
-        return np.zeros(problem.num_poses)
     u = sparse.spread(layout, sparse.factorised(matrix).solve(right))
     return np.where(layout.rank >= 0, np.angle(u), 0.0)
 
 
-def _translations(
-    problem: Problem, layout: sparse.Pattern, theta_rad: Array, covariance: Array
-) -> Array:
-    """Minimise over the positions with all headings held."""
-    if not layout.size:
-        return np.zeros((problem.num_poses, 2))
-    turned = theta_rad[problem.a] + problem.a_from_b[:, 2]
-    axes = np.stack([planar.rotated(np.eye(2)[k], turned) for k in range(2)], axis=-1)
-    weight = axes @ planar.inverted(covariance) @ np.swapaxes(axes, 1, 2)
-    step = planar.rotated(problem.a_from_b[:, :2], theta_rad[problem.a])
-    push = (weight @ step[:, :, None])[:, :, 0]
-    matrix = sparse.assembled(sparse.filling(layout, 2), weight, -weight, weight)
-    right = sparse.gathered(layout, -push, push)
-    solved = sparse.factorised(matrix).solve(right.ravel()).reshape(-1, 2)
-    return sparse.spread(layout, solved)
+def _about_headings(problem: Problem, theta_rad: Array) -> Linear:
+    """Linearise in positions and small turns, with all positions at the origin.
+
+    What a turn moves is taken from the measured steps: positions are not known yet.
+    """
+    measured = problem.a_from_b
+    turned = theta_rad[problem.b] - theta_rad[problem.a]
+    over = planar.wrapped(turned - measured[:, 2])
+    short_m = planar.rotated(-measured[:, :2], -measured[:, 2])
+    by_b = planar.turn(np.column_stack([np.zeros_like(short_m), over]))
+    step = np.column_stack([measured[:, :2], turned])
+    by_a = -by_b @ planar.adjoint(planar.inverse(step))
+    return Linear(np.column_stack([short_m, over]), by_a, by_b)
 
 
 def spanning_tree(problem: Problem) -> Array:

@@ -10,8 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csc_array
+from scipy.sparse.linalg import SuperLU
 
-from groundfuse.backend import planar, sparse
+from groundfuse.backend import normal, planar, sparse
 from groundfuse.backend.initial import chordal, layout_of
 from groundfuse.backend.problem import Array, Problem, chi2, components, linearised
 
@@ -34,6 +35,7 @@ class SolverOptions:
 DEFAULTS = SolverOptions()
 NO_DAMPING, FIRST_DAMPING, MAX_DAMPING = 1e-5, 1e-4, 1e8
 NOTHING = 1e-18  # chi2 of exact data
+FINE = 1e-2  # part of a negligible decrease that an inexact step may miss
 
 
 class Solution(NamedTuple):
@@ -61,19 +63,29 @@ def optimum(
     first pose of every connected part ends at the origin.
     """
     layout = layout_of(problem)
-    best = minimise(problem, chordal(problem, layout), layout, options)
+    fill = sparse.filling(layout, 3)
+    begin = chordal(problem, layout, fill)
+    best = minimise(problem, begin.poses, layout, options, fill=fill, known=begin.factor)
     if start is None or chi2(problem, start) >= best.chi2:
         return best
     part = components(problem)
     _, first = np.unique(part, return_index=True)
-    return minimise(problem, planar.between(start[first[part]], start), layout, options)
+    moved = planar.between(start[first[part]], start)
+    return minimise(problem, moved, layout, options, fill=fill)
 
 
 class Step(NamedTuple):
-    """A Gauss-Newton step (n, 3) and the decrease of chi2 that the linear model promises."""
+    """A Gauss-Newton step.
+
+    Attributes:
+        tangent: (n, 3).
+        promised: decrease of chi2 according to the linear model.
+        factor: that the step was solved with.
+    """
 
     tangent: Array
     promised: float
+    factor: SuperLU | None
 
 
 def minimise(
@@ -81,15 +93,29 @@ def minimise(
     start: Array,
     layout: sparse.Pattern | None = None,
     options: SolverOptions = DEFAULTS,
+    *,
+    fill: sparse.Filling | None = None,
+    known: SuperLU | None = None,
 ) -> Solution:
-    """Return the local minimum below `start` (n, 3); the held poses of the layout stay."""
+    """Return the local minimum below `start`.
+
+    Args:
+        problem: what to minimise.
+        start: (n, 3) poses; the held ones of the layout stay.
+        layout: of the problem.
+        options: how far to go.
+        fill: that of 3 x 3 blocks in the layout.
+        known: factor of normal equations in the same layout and near those of the start.
+    """
     layout = layout_of(problem) if layout is None else layout
-    fill = sparse.filling(layout, 3)
+    fill = sparse.filling(layout, 3) if fill is None else fill
     best, best_chi2 = start, chi2(problem, start)
     here, damping, waited, gain = best, 0.0, 0, 0.0
     for iteration in range(1, options.max_iterations + 1):
-        step = gauss_newton_step(problem, here, layout, damping, fill)
         enough = options.relative_decrease * best_chi2 + NOTHING
+        fine = FINE * enough
+        step = gauss_newton_step(problem, here, layout, damping, fill, known=known, fine=fine)
+        known = step.factor
         last = here is best and step.promised <= enough
         here = planar.compose(here, planar.exp(step.tangent))
         now = chi2(problem, here)
@@ -117,31 +143,32 @@ def gauss_newton_step(
     layout: sparse.Pattern,
     damping: float = 0.0,
     fill: sparse.Filling | None = None,
+    *,
+    known: SuperLU | None = None,
+    fine: float = 0.0,
 ) -> Step:
-    """Solve the normal equations, their diagonal raised by the part `damping` of itself."""
+    """Solve the normal equations, their diagonal raised by the part `damping` of itself.
+
+    A `known` factor of similar ones is used where it leads within `fine` of the promised chi2.
+    """
     if not layout.size:
-        return Step(np.zeros_like(poses), 0.0)
+        return Step(np.zeros_like(poses), 0.0, None)
     matrix, gradient = normal_equations(problem, poses, layout, fill)
+    right = -gradient.ravel()
+    solved = None
     if damping > 0.0:
         matrix.setdiag(matrix.diagonal() * (1.0 + damping))
-    solved = sparse.factorised(matrix).solve(-gradient.ravel())
-    promised = -float(solved @ gradient.ravel())
-    return Step(sparse.spread(layout, solved.reshape(-1, 3)), promised)
+    elif known is not None:
+        solved = normal.by_known_factor(matrix, right, known, fine)
+    if solved is None:
+        factor = known = sparse.factorised(matrix)
+        solved = factor.solve(right)
+    promised = float(solved @ right)
+    return Step(sparse.spread(layout, solved.reshape(-1, 3)), promised, known)
 
 
 def normal_equations(
     problem: Problem, poses: Array, layout: sparse.Pattern, fill: sparse.Filling | None = None
 ) -> tuple[csc_array, Array]:
     """Return the information matrix of the free poses and the gradient (size, 3) of chi2 / 2."""
-    linear = linearised(problem, poses)
-    left_a = np.swapaxes(linear.by_a, 1, 2) @ problem.information
-    left_b = np.swapaxes(linear.by_b, 1, 2) @ problem.information
-    matrix = sparse.assembled(
-        fill or sparse.filling(layout, 3),
-        left_a @ linear.by_a,
-        left_a @ linear.by_b,
-        left_b @ linear.by_b,
-    )
-    residual = linear.residual[:, :, None]
-    gradient = sparse.gathered(layout, (left_a @ residual)[:, :, 0], (left_b @ residual)[:, :, 0])
-    return matrix, gradient
+    return normal.of_linear(linearised(problem, poses), problem.information, layout, fill)

@@ -24,27 +24,27 @@ DISSECT = 30_000  # edges from which nested dissection pays: it takes longer and
 
 def elimination_order(num_nodes: int, a: Indices, b: Indices) -> Indices:
     """Return (n,) the position of every node in the order of elimination."""
-    pairs = np.unique(np.stack([np.minimum(a, b), np.maximum(a, b)]), axis=1)
-    nodes = np.unique(pairs)
+    key = np.unique(np.minimum(a, b) * num_nodes + np.maximum(a, b))
+    low, high = np.divmod(key, max(num_nodes, 1))
+    nodes = np.unique(np.concatenate([low, high]))
     rank = np.full(num_nodes, -1, dtype=np.int64)
     if len(nodes) > 2:
-        order = _ordered(pairs)
+        order = _ordered(low, high)
         rank[order] = np.arange(len(order))
     lone = np.flatnonzero(rank < 0)
     rank[lone] = np.arange(num_nodes - len(lone), num_nodes)
     return rank
 
 
-def _ordered(pairs: Indices) -> Indices:
-    """Return the nodes of (2, m) linked pairs in gtsam's order of elimination."""
-    graph = gtsam.NonlinearFactorGraph()
-    nothing, unit = gtsam.Pose2(), gtsam.noiseModel.Unit.Create(3)
-    for a, b in pairs.T.tolist():
-        graph.push_back(gtsam.BetweenFactorPose2(a, b, nothing, unit))
-    if pairs.shape[1] < DISSECT:
-        order = gtsam.Ordering.ColamdNonlinearFactorGraph(graph)
+def _ordered(low: Indices, high: Indices) -> Indices:
+    """Return the nodes of linked pairs in gtsam's order of elimination."""
+    graph = gtsam.SymbolicFactorGraph()
+    for a, b in zip(low.tolist(), high.tolist(), strict=True):
+        graph.push_factor(a, b)
+    if len(low) < DISSECT:
+        order = gtsam.Ordering.ColamdSymbolicFactorGraph(graph)
     else:
-        order = gtsam.Ordering.MetisNonlinearFactorGraph(graph)
+        order = gtsam.Ordering.MetisSymbolicFactorGraph(graph)
     return np.array([order.at(k) for k in range(order.size())], dtype=np.int64)
 
 

@@ -17,7 +17,7 @@ PRIOR = 1e-5
 def solved(seed, num_poses=40, num_loops=30):
     graph, _ = random_problem(np.random.default_rng(seed), num_poses, num_loops)
     layout = initial.layout_of(graph)
-    return graph, layout, solver.minimise(graph, initial.chordal(graph, layout), layout).poses
+    return graph, layout, solver.minimise(graph, initial.chordal(graph, layout).poses, layout).poses
 
 
 def close(one, two, relative=RELATIVE):
@@ -60,7 +60,7 @@ def test_parts_do_not_know_of_each_other():
     graph, _, _ = solved(3)
     apart = graph.of((graph.a < 20) == (graph.b < 20))
     layout = initial.layout_of(apart)
-    poses = solver.minimise(apart, initial.chordal(apart, layout), layout).poses
+    poses = solver.minimise(apart, initial.chordal(apart, layout).poses, layout).poses
     found = covariance.marginals(apart, poses, layout)
     assert not found[[0, 20]].any()
     assert (np.linalg.eigvalsh(found[[1, 19, 21, 39]])[:, 0] > 0.0).all()

@@ -32,7 +32,7 @@ def test_wrong_loops_end_outside_and_the_rest_at_its_optimum(seed, share):
     assert not (result.accepted & wrong).any()
     assert (~result.accepted & ~wrong).sum() <= 2  # of 40 right loops, 20 seeds: once 2
     kept = graph.of(result.accepted)
-    clean = solver.minimise(kept, initial.chordal(kept, initial.layout_of(kept)))
+    clean = solver.minimise(kept, initial.chordal(kept, initial.layout_of(kept)).poses)
     assert chi2_per_edge(kept, result.poses).sum() == pytest.approx(clean.chi2, rel=1e-6)
 
 
