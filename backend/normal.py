@@ -45,6 +45,8 @@ def by_known_factor(matrix: csc_array, right: Array, known: SuperLU, fine: float
     towards = known.solve(error)
     along = towards.copy()
     square = first = float(error @ towards)
+    if not square > 0.0:  # exact data: nothing is left to do
+        return found
     for k in range(1, MAX_ROUNDS + 1):
         image = matrix @ along
         length = square / float(along @ image)
