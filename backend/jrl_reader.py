@@ -201,17 +201,18 @@ def _covariance(content: object, place: str) -> Nine:
 
 def _values(content: object, place: str) -> Values:
     """Read poses: a list with keys inside, as the library writes, or by key, as documented."""
+    rows: list[tuple[int | None, Any]]
     if isinstance(content, dict):
-        rows = [(_written(key, place), own, ()) for key, own in content.items()]
+        rows = [(_written(key, place), own) for key, own in content.items()]
     else:
-        rows = [(None, own, ("key",)) for own in _items(content, place)]
+        rows = [(None, own) for own in _items(content, place)]
     values: Values = {}
-    for k, (known, own, more) in enumerate(rows):
+    for k, (known, own) in enumerate(rows):
         here = f"{place}[{k}]"
         tag = own.get("type", POSE) if isinstance(own, dict) else POSE
         if tag != POSE:
             raise ValueError(f"{here}: unknown type {tag}; {POSE} is read")
-        pose = _pose(own, here, *more)
+        pose = _pose(own, here, *(("key",) if known is None else ()))
         key = _whole(own["key"], f"{here}.key") if known is None else known
         if key in values:
             raise ValueError(f"{here}: key {key} is given twice")

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from groundfuse.backend import planar
+from groundfuse.backend.graph_keys import robot_name
 from groundfuse.backend.measurement import Array, FrameId, RelativePose
 
 Flags = NDArray[np.bool_]
@@ -29,9 +30,10 @@ class TeamShape:
         area_m: side of the square that the robots stay in; 0 chooses one that is well covered.
         loops: edges within each robot between frames far apart in time.
         overlaps: edges between each two robots.
+        encounters: further edges between robots, drawn over the whole team.
         reach_m: frames further apart than this have no edge; 0 means two steps.
         wrong_loops: share of the loops that are wrong.
-        wrong_overlaps: share of the overlaps that are wrong.
+        wrong_overlaps: share of the overlaps and encounters that are wrong.
         consistent: wrong edges of a pair agree with each other, as on a floor that repeats.
         sigma_m: noise of every edge, along x and y.
         sigma_rad: noise of every edge's heading.
@@ -44,6 +46,7 @@ class TeamShape:
     area_m: float = 0.0
     loops: int = 20
     overlaps: int = 20
+    encounters: int = 0
     reach_m: float = 0.0
     wrong_loops: float = 0.0
     wrong_overlaps: float = 0.0
@@ -69,9 +72,7 @@ class TeamGraphs:
     wrong: tuple[bool, ...]
 
 
-def robot_name(k: int) -> str:
-    """Return A to Z, then R26, R27, ..."""
-    return chr(ord("A") + k) if k < 26 else f"R{k}"
+Pairs = tuple[int, int, Indices, Indices, Flags]  # robots, their frames, which pairs are wrong
 
 
 def simulate(shape: TeamShape, rng: np.random.Generator) -> TeamGraphs:
@@ -85,7 +86,7 @@ def simulate(shape: TeamShape, rng: np.random.Generator) -> TeamGraphs:
     area_m = shape.area_m or shape.step_m * float(np.sqrt(shape.robots * shape.frames))
     reach_m = shape.reach_m or 2.0 * shape.step_m
     paths = _meeting_paths(shape, area_m, reach_m, rng)
-    pairs: list[tuple[int, int, Indices, Indices, Flags]] = []
+    pairs: list[Pairs] = []
     for r, path in enumerate(paths):
         number = np.arange(shape.frames - 1)
         pairs.append((r, r, number, number + 1, np.zeros(len(number), dtype=bool)))
@@ -96,6 +97,7 @@ def simulate(shape: TeamShape, rng: np.random.Generator) -> TeamGraphs:
         near = _near(paths[r], paths[s], reach_m)
         chosen = _chosen(near, paths[r], paths[s], shape.overlaps, shape.wrong_overlaps, rng)
         pairs.append((r, s, *chosen))
+    pairs += _encounters(shape, paths, reach_m, rng)
     return _measured(shape, paths, pairs, area_m, rng)
 
 
@@ -184,10 +186,36 @@ def _chosen(
     return both[:, 0], both[:, 1], flags
 
 
+def _encounters(
+    shape: TeamShape, paths: Sequence[Array], reach_m: float, rng: np.random.Generator
+) -> list[Pairs]:
+    """Draw meetings over the whole team, so that some robots meet often and others never."""
+    robots = list(combinations(range(shape.robots), 2))
+    if not shape.encounters or not robots:
+        return []
+    num_wrong = round(shape.wrong_overlaps * shape.encounters)
+    near = [_near(paths[r], paths[s], reach_m) for r, s in robots]
+    found = np.concatenate([
+        np.column_stack([np.full(len(some), k), some]) for k, some in enumerate(near)
+    ])  # fmt: skip
+    right = found[rng.permutation(len(found))[: shape.encounters - num_wrong]]
+    wrong = np.column_stack([
+        rng.integers(0, len(robots), num_wrong),
+        *rng.integers(0, shape.frames, (2, num_wrong)),
+    ])  # fmt: skip
+    drawn = np.concatenate([right, wrong])
+    flags = np.arange(len(drawn)) >= len(right)
+    return [
+        (*robots[k], drawn[here, 1], drawn[here, 2], flags[here])
+        for k in np.unique(drawn[:, 0]).tolist()
+        for here in [np.flatnonzero(drawn[:, 0] == k)]
+    ]
+
+
 def _measured(
     shape: TeamShape,
     paths: Sequence[Array],
-    pairs: Sequence[tuple[int, int, Indices, Indices, Flags]],
+    pairs: Sequence[Pairs],
     area_m: float,
     rng: np.random.Generator,
 ) -> TeamGraphs:
