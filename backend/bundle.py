@@ -49,6 +49,7 @@ from groundfuse.backend.bundle_tracks import (
     sightings_from_edges,
     single_links,
     tracks,
+    with_gains,
 )
 from groundfuse.backend.measurement import Attitude, FrameId, RelativePose, TeamEstimate
 
@@ -127,6 +128,8 @@ def bundle(
     ]
     priors = priors_of(team, prior, sigma, options)
     sightings, links = sightings_from_edges(used, team.index_of)
+    tables = [cameras[name].focal_gains for name in team.robots]
+    sightings = with_gains(sightings, team.robot_of, tables)
     state = start_state(team, start, priors, cameras)
     job = Job(team, cameras, sightings, links, used, options)
     try:

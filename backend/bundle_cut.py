@@ -39,7 +39,7 @@ def link_chi2(
 
     A point above the floor lands elsewhere for each camera: relief counts as variance.
     """
-    landing = floor_points(sightings.frame, sightings.ray, state, priors.robot_of)
+    landing = floor_points(sightings.frame, sightings.ray, sightings.gain, state, priors.robot_of)
     spread = landing.by_ray @ landing.by_ray.transpose(0, 2, 1)
     spread *= ((noise * sightings.sigma) ** 2)[:, None, None]
     apart = landing.point[links.a] - landing.point[links.b]

@@ -6,6 +6,8 @@ from enum import StrEnum
 
 from groundfuse.backend.measurement import Attitude, FrameId, Rejected, Se2, TeamEstimate
 
+FocalGains = tuple[tuple[float, float], ...]
+
 
 class Refine(StrEnum):
     """Whether a number of the camera file is estimated."""
@@ -93,10 +95,14 @@ class BundleCamera:
     Attributes:
         base_from_foot: planar offset and yaw of the camera on the robot.
         focal_px: focal length, by which residuals are stated in pixels.
+        focal_gains: by what multiple of its length an undistorted ray grows with the fraction by
+            which the focal length does, at ascending lengths of the ray: 1 without distortion,
+            which nothing stands for too; (1 + r^2) atan(r) / r for a fisheye.
     """
 
     base_from_foot: Se2
     focal_px: float
+    focal_gains: FocalGains = ()
 
 
 @dataclass(frozen=True, slots=True)

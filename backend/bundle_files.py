@@ -27,6 +27,9 @@ from groundfuse.backend.bundle_solve import (
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+TOLD_WIDTH = 3.0
+"""Width of the kernel where sigmas are told and one step is taken. A narrow kernel is the more robust
+estimate, but its weights understate what good sightings tell, and its steps fall short."""
 MOUNT, LENS = slice(0, 3), slice(3, 5)
 
 
@@ -58,7 +61,7 @@ def files_test(problem: Problem, solution: Solution, options: BundleOptions) -> 
     lens = np.array([options.focal, options.distortion]) != Refine.NEVER
     asked = np.tile(np.concatenate([[True] * 3, lens]), (priors.num_robots, 1))
     trial = replace(problem, priors=freed_priors(priors, asked))
-    kernel = Kernel(options.robust_sigma, solution.noise, solution.noise)
+    kernel = Kernel(max(options.robust_sigma, TOLD_WIDTH), solution.noise, solution.noise)
     system = system_at(trial, solution.state, solution.errors, kernel, 0.0)
     _, step, _ = step_from(trial, system, solution.state, solution.errors, kernel)
     robots = np.arange(priors.num_frames, priors.num_nodes)

@@ -4,7 +4,8 @@ The same camera as in `reprojection.py`, written out by components because it ru
 sightings at once. With tilt a, roll r, height h and the floor point q in `foot`, the camera sees
 X = -cos r qy + h sin r, Y = -cos a qx + sin r sin a qy + h cos r sin a,
 Z = sin a qx + sin r cos a qy + h cos r cos a, ray (X, Y) / Z; and with a focal length longer by the
-fraction f and a first distortion term larger by k, the ray (1 + f) (1 + k |ray|^2) ray.
+fraction f and a first distortion term larger by k, the ray (1 + g f) (1 + k |ray|^2) ray. The gain
+g is 1 for a pinhole; behind a distorting lens a ray grows by another multiple, a fisheye's by far.
 """
 
 from dataclasses import dataclass
@@ -110,7 +111,9 @@ def residuals(seen: Observations, state: State, robot_of: Integers) -> tuple[Arr
     for part in seen.parts:
         view = view_of(seen, state, part)
         shared = state.shared[robot_of[seen.frame[part]]]
-        factor = (1.0 + shared[:, 3]) * (1.0 + shared[:, 4] * (view.x**2 + view.y**2))
+        factor = (1.0 + shared[:, 3] * seen.gain[part]) * (
+            1.0 + shared[:, 4] * (view.x**2 + view.y**2)
+        )
         result[part, 0] = seen.ray[part, 0] - factor * view.x
         result[part, 1] = seen.ray[part, 1] - factor * view.y
         unseen[part] = view.per_depth == 0.0
@@ -137,13 +140,16 @@ def derivatives(view: View) -> Derivatives:
     return Derivatives(by_frame, by_point, np.zeros_like(by_point[:2]))
 
 
-def through_lens(ideal: Derivatives, view: View, shared: Array) -> Derivatives:
-    """Carry derivatives through focal length and distortion; `shared` (n, 6) of each sighting."""
+def through_lens(ideal: Derivatives, view: View, shared: Array, gain: Array) -> Derivatives:
+    """Carry derivatives through focal length and distortion.
+
+    `shared` (n, 6) and the focal length's `gain` (n,) are each sighting's.
+    """
     ray = np.stack([view.x, view.y], axis=1)
-    focal, term = 1.0 + shared[:, 3:4], shared[:, 4:5]
+    focal, term = 1.0 + shared[:, 3:4] * gain[:, None], shared[:, 4:5]
     radius2 = np.sum(ray * ray, axis=1, keepdims=True)
     bulge = 1.0 + term * radius2
-    by_lens = np.stack([ray * bulge, ray * focal * radius2])
+    by_lens = np.stack([ray * bulge * gain[:, None], ray * focal * radius2])
     factor, gain = focal * bulge, 2.0 * focal * term * ray
 
     def carried(derivative: Array) -> Array:
@@ -169,11 +175,14 @@ class Landing:
     slope: Array
 
 
-def floor_points(frame: Integers, ray: Array, state: State, robot_of: Integers) -> Landing:
-    """Intersect rays with the flat floor."""
+def floor_points(
+    frame: Integers, ray: Array, gain: Array | None, state: State, robot_of: Integers
+) -> Landing:
+    """Intersect rays with the flat floor; `gain` (n,) as in `Sightings`."""
     shared = state.shared[robot_of[frame]]
     radius2 = np.sum(ray * ray, axis=1, keepdims=True)
-    ray = ray / ((1.0 + shared[:, 3:4]) * (1.0 + shared[:, 4:5] * radius2))
+    longer = shared[:, 3:4] * (1.0 if gain is None else gain[:, None])
+    ray = ray / ((1.0 + longer) * (1.0 + shared[:, 4:5] * radius2))
     ca, sa = np.cos(state.attitude[:, 0])[frame], np.sin(state.attitude[:, 0])[frame]
     cr, sr = np.cos(state.attitude[:, 1])[frame], np.sin(state.attitude[:, 1])[frame]
     h = state.attitude[:, 2][frame]

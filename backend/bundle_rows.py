@@ -43,7 +43,7 @@ def whitened_rows(seen: Observations, state: State, weight: Array, priors: Prior
         found = derivatives(view)
         robot = priors.robot_of[seen.frame[part]]
         if lens or state.shared[:, 3:5].any():
-            found = through_lens(found, view, state.shared[robot])
+            found = through_lens(found, view, state.shared[robot], seen.gain[part])
         if lens:
             free = priors.free_lens[robot].T[:, :, None]
             by_lens[:, part] = found.by_lens * root_weight[part] * free

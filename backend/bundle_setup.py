@@ -142,7 +142,7 @@ def start_state(
 
 def with_points(state: State, seen: Observations, robot_of: Integers) -> State:
     """Put each floor point where its sightings meet the floor on average."""
-    found = floor_points(seen.frame, seen.ray, state, robot_of).point
+    found = floor_points(seen.frame, seen.ray, seen.gain, state, robot_of).point
     good = np.isfinite(found).all(axis=1)
     times = np.bincount(seen.point[good], minlength=seen.num_points)
     sums = [np.bincount(seen.point[good], found[good, axis], seen.num_points) for axis in range(2)]

@@ -5,13 +5,14 @@ it makes one floor point of it, so that its noise counts once and not once per p
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from groundfuse.backend.bundle_estimate import FocalGains
 from groundfuse.backend.measurement import FrameId, RelativePose
 
 Array = NDArray[np.float64]
@@ -32,11 +33,20 @@ PIECE = 4096
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sightings:
-    """Keypoints: frame (n,), ray (n, 2) and one-axis sigma (n,) of each."""
+    """Keypoints.
+
+    Attributes:
+        frame: (n,) of each.
+        ray: (n, 2) without distortion, as the file has it.
+        sigma: (n,) one-axis standard deviation.
+        gain: (n,) by what multiple of its length a ray grows with the focal length's fraction; None
+            for pinholes: once.
+    """
 
     frame: Integers
     ray: Array
     sigma: Array
+    gain: Array | None = None
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -68,6 +78,7 @@ class Observations:
         first: (points,) the first observation of each floor point.
         ray: (n, 2) measured ray.
         sigma: (n,) one-axis standard deviation.
+        gain: (n,) of focal lengths, see `Sightings`.
         num_points: floor points.
         frame_start: (frames + 1,) first observation of each frame.
         pair_i: (m,) first observation of each pair, sorted by the frames of both.
@@ -83,6 +94,7 @@ class Observations:
     first: Integers
     ray: Array
     sigma: Array
+    gain: Array
     num_points: int
     frame_start: Integers
     pair_i: Integers
@@ -129,6 +141,24 @@ def sightings_from_edges(
     # Every pair has an estimate of its own of how noisy its keypoints are.
     mean_square = np.bincount(which, sigma**2) / np.bincount(which)
     return Sightings(frame[first], ray[first], np.sqrt(mean_square)), links
+
+
+def with_gains(sightings: Sightings, robot_of: Integers, tables: Sequence[FocalGains]) -> Sightings:
+    """Look up what each ray makes of a longer focal length; `robot_of` (frames,), `tables` each."""
+    gain, robot = np.ones(len(sightings)), robot_of[sightings.frame]
+    for index, table in enumerate(tables):
+        mine = robot == index
+        gain[mine] = gain_at(sightings.ray[mine], table)
+    return replace(sightings, gain=gain)
+
+
+def gain_at(ray: Array, table: FocalGains) -> Array:
+    """Interpolate a table at rays (n, 2)."""
+    if not table:
+        return np.ones(len(ray))
+    radius, gain = np.array(table).T
+    found: Array = np.interp(np.sqrt(np.sum(ray * ray, axis=1)), radius, gain)
+    return found
 
 
 def tracks(links: Links, sightings: Sightings) -> tuple[Integers, Integers]:
@@ -193,6 +223,7 @@ def observations(
         np.unique(point, return_index=True)[1],
         sightings.ray[used],
         sightings.sigma[used],
+        np.ones(len(used)) if sightings.gain is None else sightings.gain[used],
         int(point.max()) + 1 if len(point) else 0,
         frame_start,
         pair_i[by_key],

@@ -59,6 +59,16 @@ class Intrinsics:
         """Geometric mean of both focal lengths."""
         return math.sqrt(self.fx_px * self.fy_px)
 
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether nothing bends the rays; a fisheye bends them with all coefficients zero too."""
+        return self.model is not Distortion.EQUIDISTANT and not any(self.coefficients)
+
+    @property
+    def _at_least_four(self) -> tuple[float, ...]:
+        """Coefficients as OpenCV takes them."""
+        return (*self.coefficients, *(0.0,) * (4 - len(self.coefficients)))
+
     def _matrix(self) -> Points:
         return np.array(
             [[self.fx_px, 0.0, self.cx_px], [0.0, self.fy_px, self.cy_px], [0.0, 0.0, 1.0]]
@@ -68,10 +78,10 @@ class Intrinsics:
         """Undistort pixels (n, 2) to rays (n, 2); a pixel without a ray becomes nan."""
         if len(points_px) == 0:
             return np.zeros((0, 2))
-        if not any(self.coefficients):
+        if self.is_pinhole:
             return self._pinhole_rays(points_px)
         points = np.ascontiguousarray(points_px, dtype=np.float64).reshape(-1, 1, 2)
-        matrix, coefficients = self._matrix(), np.array(self.coefficients)
+        matrix, coefficients = self._matrix(), np.array(self._at_least_four)
         if self.model is Distortion.EQUIDISTANT:
             start = cv2.fisheye.undistortPoints(points, matrix, coefficients)
         else:
@@ -107,7 +117,7 @@ class Intrinsics:
 
     def px_from_rays(self, rays: Points) -> Points:
         """Project rays (n, 2) to distorted pixels (n, 2); nan stays nan."""
-        if not any(self.coefficients):
+        if self.is_pinhole:
             focal, centre = np.array([self.fx_px, self.fy_px]), np.array([self.cx_px, self.cy_px])
             pinhole: Points = rays * focal + centre
             return pinhole
@@ -119,7 +129,7 @@ class Intrinsics:
         radius = np.hypot(rays[:, 0], rays[:, 1])
         angle = np.arctan(radius)
         powers = np.stack([angle ** (2 * k) for k in range(5)], axis=1)
-        distorted = angle * (powers @ np.array([1.0, *self.coefficients]))
+        distorted = angle * (powers @ np.array([1.0, *self._at_least_four]))
         factor = np.divide(distorted, radius, out=np.ones_like(radius), where=radius > 0.0)
         focal, centre = np.array([self.fx_px, self.fy_px]), np.array([self.cx_px, self.cy_px])
         pixels: Points = rays * factor[:, None] * focal + centre

@@ -71,7 +71,7 @@ def widest_ray(camera: Camera) -> float:
     A little over the picture's own widest ray where the lens allows: what lies just outside is
     needed to interpolate at the corners.
     """
-    if not any(camera.intrinsics.coefficients):
+    if camera.intrinsics.is_pinhole:
         return math.inf
     rays, _, _ = _lattice(camera)
     length = np.nan_to_num(np.hypot(rays[:, 0], rays[:, 1]))

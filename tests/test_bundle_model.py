@@ -39,9 +39,11 @@ def seen_from(pose, attitude, lens, seed):
     rays = rays_from_floor(Attitude(*attitude), Se2(*pose).inverse().apply(floor))
     inside = (np.abs(rays) < 1.0).all(axis=1)
     floor, rays = floor[inside], rays[inside]
-    measured = rays * (1 + lens[0]) * (1 + lens[1] * (rays**2).sum(axis=1))[:, None]
+    gain = rng.uniform(0.8, 1.4, len(rays))
+    bulge = 1 + lens[1] * (rays**2).sum(axis=1)
+    measured = rays * ((1 + gain * lens[0]) * bulge)[:, None]
     frame = np.ones(len(rays), dtype=np.int64)
-    sightings = Sightings(frame, measured, np.full(len(rays), 1e-3))
+    sightings = Sightings(frame, measured, np.full(len(rays), 1e-3), gain)
     seen = observations(sightings, np.arange(len(rays)), np.arange(len(rays)), 2)
     shared = np.zeros((2, 6))
     shared[1, 3:5] = lens
@@ -82,7 +84,7 @@ def test_derivatives_agree_with_differences(pose, attitude, lens, seed):
     state.point[:, 2] = np.random.default_rng(seed).normal(0, 0.02, len(state.point))
     whole = slice(0, len(seen.frame))
     view = view_of(seen, state, whole)
-    found = through_lens(derivatives(view), view, state.shared[ROBOT_OF[seen.frame]])
+    found = through_lens(derivatives(view), view, state.shared[ROBOT_OF[seen.frame]], seen.gain)
 
     def changed(node, axis, size):
         step = np.zeros((4, 6))
@@ -105,15 +107,15 @@ def test_derivatives_agree_with_differences(pose, attitude, lens, seed):
 @given(poses, attitudes, st.integers(0, 99))
 def test_rays_meet_the_floor_where_the_front_end_says(pose, attitude, seed):
     seen, state = seen_from(pose, attitude, (0.0, 0.0), seed)
-    found = floor_points(seen.frame, seen.ray, state, ROBOT_OF)
+    found = floor_points(seen.frame, seen.ray, seen.gain, state, ROBOT_OF)
     expected = Se2(*pose).apply(floor_from_rays(Attitude(*attitude), seen.ray))
     np.testing.assert_allclose(found.point, expected, atol=TOLERANCE_RAY * 100)
     foot = np.array(pose[:2])
     np.testing.assert_allclose(found.point, foot + found.slope * attitude[2], atol=1e-12)
     for axis in range(2):
         step = np.eye(2)[axis] * STEP
-        plus = floor_points(seen.frame, seen.ray + step, state, ROBOT_OF).point
-        minus = floor_points(seen.frame, seen.ray - step, state, ROBOT_OF).point
+        plus = floor_points(seen.frame, seen.ray + step, seen.gain, state, ROBOT_OF).point
+        minus = floor_points(seen.frame, seen.ray - step, seen.gain, state, ROBOT_OF).point
         numeric, analytic = (plus - minus) / (2 * STEP), found.by_ray[:, :, axis]
         scale = 1.0 + np.abs(analytic) ** 1.5  # the third derivative grows faster than the first
         assert (np.abs(analytic - numeric) / scale < 10 * TOLERANCE_DERIVATIVE).all()
@@ -123,9 +125,9 @@ def test_the_lens_is_taken_off_before_rays_meet_the_floor():
     # The inverse is to first order in the distortion: 0.01^2 x radius^4 of a ray of length 0.5.
     seen, state = seen_from((0.3, -0.2, 1.0), (0.5, 0.05, 0.8), (0.01, 0.01), 1)
     true = state.point[seen.point, :2]
-    points = floor_points(seen.frame, seen.ray, state, ROBOT_OF).point
+    points = floor_points(seen.frame, seen.ray, seen.gain, state, ROBOT_OF).point
     np.testing.assert_allclose(points, true, atol=3e-3)
-    plain = floor_points(seen.frame, seen.ray, with_shared(state, 0.0), ROBOT_OF).point
+    plain = floor_points(seen.frame, seen.ray, seen.gain, with_shared(state, 0.0), ROBOT_OF).point
     assert np.abs(points - true).max() < np.abs(plain - true).max() / 20
 
 
@@ -138,7 +140,7 @@ def test_a_point_behind_the_camera_is_unseen():
     away = State(state.pose, state.attitude, state.shared, state.point - np.array([50.0, 0.0, 0.0]))
     _, unseen = residuals(seen, away, ROBOT_OF)
     assert unseen.all()
-    landing = floor_points(np.array([1]), np.array([[0.0, -3.0]]), state, ROBOT_OF)
+    landing = floor_points(np.array([1]), np.array([[0.0, -3.0]]), None, state, ROBOT_OF)
     assert np.isnan(landing.point).all()
 
 

@@ -50,7 +50,7 @@ def lenses(draw):
 def rays_of(seed, lens):
     """Rays over the field that the model is for: up to 72 deg off the axis for a fisheye."""
     rng = np.random.default_rng(seed)
-    wide = 3.0 if lens.model is Distortion.EQUIDISTANT and any(lens.coefficients) else 0.6
+    wide = 3.0 if lens.model is Distortion.EQUIDISTANT else 0.6
     rays = rng.uniform(-0.6, 0.6, (40, 2))
     rays = rays / np.hypot(*rays.T)[:, None] * rng.uniform(0.0, wide, (40, 1))
     return np.concatenate([rays, np.zeros((1, 2))])
@@ -60,13 +60,13 @@ def opencv_pixels(lens, rays):
     points = np.column_stack([rays, np.ones(len(rays))]).reshape(-1, 1, 3)
     matrix = np.array([[lens.fx_px, 0, lens.cx_px], [0, lens.fy_px, lens.cy_px], [0, 0, 1.0]])
     still = np.zeros(3)
-    if lens.model is Distortion.EQUIDISTANT and any(lens.coefficients):
+    if lens.model is Distortion.EQUIDISTANT:
         pixels, _ = cv2.fisheye.projectPoints(
             points,
             still.reshape(1, 1, 3),
             still.reshape(1, 1, 3),
             matrix,
-            np.array(lens.coefficients),
+            np.array(lens.coefficients or (0.0,) * 4),
         )
     else:
         coefficients = np.array(lens.coefficients) if lens.coefficients else np.zeros(5)
@@ -153,3 +153,22 @@ def test_used_rows_and_pickling():
     assert camera.used_rows == (12, 479)
     assert Camera(lens, camera.mount, 12, 400).used_rows == (12, 400)
     assert pickle.loads(pickle.dumps(camera)) == camera  # noqa: S301 (our own)
+
+
+def test_an_ideal_fisheye_is_no_pinhole():
+    for coefficients in ((), (0.0,) * 4):
+        lens = Intrinsics(
+            640, 480, 500.0, 500.0, 320.0, 240.0, Distortion.EQUIDISTANT, coefficients
+        )
+        ray = np.array([[1.0, 0.0], [0.0, 0.0]])
+        pixels = np.array([[320.0 + 500.0 * math.pi / 4, 240.0], [320.0, 240.0]])
+        np.testing.assert_allclose(lens.px_from_rays(ray), pixels, atol=1e-9)
+        np.testing.assert_allclose(lens.rays_from_px(pixels), ray, atol=1e-8)
+
+
+def test_a_single_coefficient_is_enough():
+    lens = Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0, Distortion.PLUMB_BOB, (-0.1,))
+    rays = np.array([[0.4, -0.2]])
+    wanted = np.array([[320.0, 240.0]]) + 500.0 * rays * (1 - 0.1 * 0.2)
+    np.testing.assert_allclose(lens.px_from_rays(rays), wanted, atol=1e-9)
+    np.testing.assert_allclose(lens.rays_from_px(wanted), rays, atol=1e-8)

@@ -47,12 +47,15 @@ def _used(found: Estimated | None) -> float:
 
 
 def corrected_lens(lens: Intrinsics, focal: float, term: float) -> Intrinsics:
-    """Return the lens whose rays are the true ones of `(1 + focal) (1 + term |ray|^2) ray = filed`.
+    """Return the lens with its focal length longer by a fraction, and its first term larger.
 
-    Focal length and first distortion term are fitted to the pixels of a grid; the fit is exact for
-    a pinhole, and good to a hundredth of a pixel for the usual lenses and corrections.
+    The term is that of rays without distortion, `(1 + term |true|^2) true = filed`: what comes
+    nearest to it is fitted to the pixels of a grid, good to a hundredth of a pixel for the usual
+    lenses and corrections.
     """
-    if focal == 0.0 and term == 0.0:
+    longer = 1.0 + focal
+    lens = replace(lens, fx_px=lens.fx_px * longer, fy_px=lens.fy_px * longer)
+    if term == 0.0:
         return lens
     u, v = np.meshgrid(
         np.linspace(0.0, lens.width_px - 1.0, GRID), np.linspace(0.0, lens.height_px - 1.0, GRID)
@@ -60,24 +63,21 @@ def corrected_lens(lens: Intrinsics, focal: float, term: float) -> Intrinsics:
     pixels = np.column_stack([u.ravel(), v.ravel()])
     filed = lens.rays_from_px(pixels)
     seen = np.isfinite(filed).all(axis=1)
-    true = _true_rays(filed[seen], focal, term)
+    true = _true_rays(filed[seen], term)
     centre = np.array([lens.cx_px, lens.cy_px])
     straight = (_with_first_term(lens, 0.0).px_from_rays(true) - centre).ravel()
     bent = (_with_first_term(lens, 1.0).px_from_rays(true) - centre).ravel() - straight
-    target = (pixels[seen] - centre).ravel()
-    if term == 0.0 and not any(lens.coefficients):
-        bent = np.zeros_like(bent)
     (scale, scaled_term), *_ = np.linalg.lstsq(
-        np.stack([straight, bent], axis=1), target, rcond=None
+        np.stack([straight, bent], axis=1), (pixels[seen] - centre).ravel(), rcond=None
     )
-    better = _with_first_term(lens, float(scaled_term / scale)) if bent.any() else lens
+    better = _with_first_term(lens, float(scaled_term / scale))
     return replace(better, fx_px=lens.fx_px * float(scale), fy_px=lens.fy_px * float(scale))
 
 
-def _true_rays(filed: Points, focal: float, term: float) -> Points:
-    rays = filed / (1.0 + focal)
+def _true_rays(filed: Points, term: float) -> Points:
+    rays = filed
     for _ in range(FIXED_POINT_STEPS):
-        rays = filed / ((1.0 + focal) * (1.0 + term * np.sum(rays**2, axis=1, keepdims=True)))
+        rays = filed / (1.0 + term * np.sum(rays**2, axis=1, keepdims=True))
     return rays
 
 

@@ -1,4 +1,4 @@
-"""A second look with better camera files: where the pictures contradict a file, match them again.
+"""Another look with better camera files: where pictures contradict a file, match them again.
 
 A wrong file costs more than its own error: right correspondences that do not fit it are turned
 down, and those that remain are the ones that resemble it, so that an estimate of the file's error
@@ -7,35 +7,51 @@ is still told what the files say, so that all it states is said about them.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from groundfuse.backend.bundle_estimate import Estimated, MountEstimate
+from groundfuse.backend.bundle_estimate import Estimated, FocalGains, MountEstimate
+from groundfuse.backend.bundle_tracks import gain_at
 from groundfuse.backend.measurement import Array, Attitude, Correspondences, RelativePose
 from groundfuse.tools.calibration_file import calibrated_camera
+from groundfuse.tools.focal_gain import focal_gains
 from groundfuse.tools.robot import Robot
 
-WORTH_SIGMA = 0.5
-"""A mount this far off, in its pictures' own wobble, is worth a second look; a lens always is."""
+WORTH_WOBBLE = 0.5
+"""A mount this far off, in its pictures' own wobble, is worth another look."""
+WORTH_SIGMA = 1.0
+"""A lens is, where this much of its own sigma is still wrong."""
 
 
-def is_worth_it(robots: Sequence[Robot], mounts: Sequence[MountEstimate]) -> bool:
-    """Whether a file is off by enough to have cost pairs."""
-    of = {robot.name: robot.camera.mount for robot in robots}
-    for found in mounts:
-        mount = of[found.robot]
-        height = correction(found.height) * mount.attitude.height_m
-        for value, sigma in (
-            (correction(found.tilt_rad), mount.sigma.tilt_rad),
-            (correction(found.roll_rad), mount.sigma.roll_rad),
-            (height, mount.sigma.height_m),
-        ):
-            if abs(value) > WORTH_SIGMA * sigma:
-                return True
-        if correction(found.focal) != 0.0 or correction(found.distortion) != 0.0:
+def is_worth_it(
+    robots: Sequence[Robot], assumed: Sequence[MountEstimate], found: Sequence[MountEstimate]
+) -> bool:
+    """Whether the cameras that the pairs were measured with are off by enough to have cost pairs.
+
+    Args:
+        robots: as filed.
+        assumed: what the last look took them for; nothing means the files.
+        found: what the bundle says now.
+    """
+    before = {mount.robot: _numbers(mount) for mount in assumed}
+    wobble = {robot.name: robot.camera.mount for robot in robots}
+    for mount in found:
+        change = np.abs(_numbers(mount) - before.get(mount.robot, np.zeros(5)))
+        of = wobble[mount.robot]
+        own = of.sigma.tilt_rad, of.sigma.roll_rad, of.sigma.height_m / of.attitude.height_m
+        if np.any(change[:3] > WORTH_WOBBLE * np.array(own)):
+            return True
+        lens = [0.0 if f is None else f.sigma for f in (mount.focal, mount.distortion)]
+        if np.any(change[3:] > WORTH_SIGMA * np.array(lens)):
             return True
     return False
+
+
+def _numbers(found: MountEstimate) -> Array:
+    """Corrections (5,) of tilt, roll, height, focal length and distortion."""
+    kinds = (found.tilt_rad, found.roll_rad, found.height, found.focal, found.distortion)
+    return np.array([correction(kind) for kind in kinds])
 
 
 def correction(found: Estimated | None) -> float:
@@ -64,34 +80,49 @@ def _corrected(robot: Robot, found: MountEstimate) -> Robot:
 
 
 def as_filed(
-    edges: Sequence[RelativePose], mounts: Sequence[MountEstimate]
+    edges: Sequence[RelativePose], robots: Sequence[Robot], mounts: Sequence[MountEstimate]
 ) -> tuple[RelativePose, ...]:
-    """Return the edges with their rays as the files' lenses would have them.
+    """Return the edges with their rays as the lenses of the files (`robots`) would have them.
 
-    The rays are those of corrected cameras; the bundle's model of a lens, filed = (1 + focal)
-    (1 + term |ray|^2) ray, takes them back, so that a second bundle tells of the same files.
+    The rays are those of corrected cameras; the bundle's model of a lens takes them back, so that
+    another bundle tells of the same files.
     """
-    lenses = {
-        found.robot: (correction(found.focal), correction(found.distortion)) for found in mounts
-    }
+    lenses = {robot.name: Lens(0.0, 0.0, focal_gains(robot.camera.intrinsics)) for robot in robots}
+    for found in mounts:
+        lenses[found.robot] = replace(
+            lenses[found.robot],
+            focal=correction(found.focal),
+            distortion=correction(found.distortion),
+        )
     return tuple(_edge_as_filed(edge, lenses) for edge in edges)
 
 
-def _edge_as_filed(edge: RelativePose, lenses: Mapping[str, tuple[float, float]]) -> RelativePose:
-    of_a, of_b = lenses.get(edge.a.robot, (0.0, 0.0)), lenses.get(edge.b.robot, (0.0, 0.0))
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """How far a lens is off its file, and what a ray makes of a longer focal length."""
+
+    focal: float
+    distortion: float
+    gains: FocalGains
+
+
+def _edge_as_filed(edge: RelativePose, lenses: Mapping[str, Lens]) -> RelativePose:
+    of_a, of_b = lenses[edge.a.robot], lenses[edge.b.robot]
     points = edge.correspondences
-    if points is None or not (any(of_a) or any(of_b)):
+    if points is None or not any((of_a.focal, of_a.distortion, of_b.focal, of_b.distortion)):
         return edge
     filed = Correspondences(
-        _bent(points.rays_a, *of_a),
-        _bent(points.rays_b, *of_b),
-        points.sigma_a * (1.0 + of_a[0]),
-        points.sigma_b * (1.0 + of_b[0]),
+        _bent(points.rays_a, of_a),
+        _bent(points.rays_b, of_b),
+        points.sigma_a * (1.0 + of_a.focal),
+        points.sigma_b * (1.0 + of_b.focal),
     )
     return replace(edge, correspondences=filed)
 
 
-def _bent(rays: Array, focal: float, term: float) -> Array:
+def _bent(rays: Array, lens: Lens) -> Array:
     """Apply the bundle's lens to rays (n, 2); equal rays stay equal to the bit."""
-    bent: Array = rays * ((1.0 + focal) * (1.0 + term * np.sum(rays**2, axis=1, keepdims=True)))
+    longer = 1.0 + lens.focal * gain_at(rays, lens.gains)
+    bulge = 1.0 + lens.distortion * np.sum(rays**2, axis=1)
+    bent: Array = rays * (longer * bulge)[:, None]
     return bent
