@@ -28,8 +28,8 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 TOLD_WIDTH = 3.0
-"""Width of the kernel where sigmas are told and one step is taken. A narrow kernel is the more robust
-estimate, but its weights understate what good sightings tell, and its steps fall short."""
+"""Width of the kernel where sigmas are told and one step is taken. A narrow kernel is the more
+robust estimate, but its weights understate what good sightings tell, and its steps fall short."""
 MOUNT, LENS = slice(0, 3), slice(3, 5)
 
 
