@@ -33,7 +33,7 @@ def neighbour_pairs(frames: Sequence[FrameId]) -> list[Pair]:
 def retrieved_pairs(features: Mapping[FrameId, Features], options: PairOptions) -> list[Pair]:
     """Return pairs that look alike, anywhere in the team."""
     order = sorted(features)
-    found = retrieved([features[f] for f in order], options.retrieval)
+    found = retrieved((features[f] for f in order), options.retrieval)
     return [(order[i], order[j]) for i, j in found]
 
 

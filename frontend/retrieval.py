@@ -5,7 +5,7 @@ components; each of a frame's strongest features looks up its nearest features i
 and votes for their frames, near kin more than far.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,16 +34,17 @@ class RetrievalOptions:
     num_frames: int = 8
 
 
-def similarity(frames: Sequence[Features], options: RetrievalOptions) -> NDArray[np.float64]:
-    """Return (n, n) votes between frames, symmetric, zero on the diagonal."""
-    votes = np.zeros((len(frames), len(frames)))
-    owner = np.concatenate(
-        [np.full(min(len(f), options.num_features), k) for k, f in enumerate(frames)]
-        or [np.zeros(0, np.int64)]
-    ).astype(np.int64)
+def similarity(frames: Iterable[Features], options: RetrievalOptions) -> NDArray[np.float64]:
+    """Return (n, n) votes between frames, symmetric, zero on the diagonal.
+
+    Frames are read once, one after the other: they need not be in memory together.
+    """
+    chosen = [_strided(frame, options.num_features) for frame in frames]
+    votes = np.zeros((len(chosen), len(chosen)))
+    owner = np.repeat(np.arange(len(chosen)), [len(rows) for rows in chosen])
     if len(owner) == 0:
         return votes
-    short = _reduced([_strided(f, options.num_features) for f in frames], options.num_components)
+    short = _reduced(chosen, options.num_components)
     for start in range(0, len(owner), CHUNK):
         rows = slice(start, start + CHUNK)
         likeness = short[rows] @ short.T
@@ -88,7 +89,7 @@ def _vote(
     np.add.at(votes, (np.repeat(voter, count), owner[nearest.ravel()]), weight.ravel())
 
 
-def retrieved(frames: Sequence[Features], options: RetrievalOptions) -> list[tuple[int, int]]:
+def retrieved(frames: Iterable[Features], options: RetrievalOptions) -> list[tuple[int, int]]:
     """Return pairs (i, j), i < j, where one is among the most similar frames of the other."""
     votes = similarity(frames, options)
     pairs: set[tuple[int, int]] = set()

@@ -2,7 +2,6 @@
 
 import itertools
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 from painted_team import Member, arc, make_camera
@@ -19,7 +18,7 @@ from groundfuse.backend.measurement import (
     Se2,
 )
 from groundfuse.backend.team import fuse
-from groundfuse.tools.front_end import FrontEndResult
+from groundfuse.tools.front_end import FrontEndResult, Reused
 from groundfuse.tools.pipeline import Fused, odometry_edges
 from groundfuse.tools.robot import Frame, Odometry, Robot
 
@@ -84,11 +83,12 @@ def fused_of(robots, edges, turned=(), repetition=0.1, bundled=None):
     """What the main job makes of edges, without a bundle."""
     frames = [f.id for robot in robots for f in robot.frames]
     repeats = repetition if isinstance(repetition, dict) else dict.fromkeys(frames, repetition)
-    features = {f: SimpleNamespace(repetition=repeats.get(f, 0.0)) for f in frames}
-    front_end = FrontEndResult(tuple(edges), tuple(turned), features)
+    second = {f: repeats.get(f, 0.0) for f in frames}
+    reused = Reused(0, len(frames), 0, len(edges) + len(turned))
+    front_end = FrontEndResult(tuple(edges), tuple(turned), second, {}, reused, b"")
     every = (*edges, *odometry_edges(robots))
     alone = {r.name: robot_estimate(r.name, frames, every) for r in robots}
-    return Fused(robots, front_end, every, alone, fuse(frames, every), bundled)
+    return Fused(robots, robots, front_end, every, alone, fuse(frames, every), bundled)
 
 
 def bundle_of(team, *, poses=None, rejected=(), attitude=None, sigma=None, findings=()):

@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import functools
 import math
+import time
 from pathlib import Path
 
 import cv2
@@ -27,21 +28,13 @@ from groundfuse.frontend.pairs import PairOptions
 from groundfuse.frontend.repetition import REPEATS
 from groundfuse.frontend.retrieval import RetrievalOptions
 from groundfuse.tools.errors import DataError
-from groundfuse.tools.front_end import (
-    FrontEndOptions,
-    FrontEndResult,
-    Matcher,
-    Seen,
-    _odometry_gate,
-    _swayed,
-    compare,
-    in_threads,
-    look,
-    run_front_end,
-    with_matcher,
-)
+from groundfuse.tools.front_end import FrontEndResult, run_front_end
+from groundfuse.tools.front_end_options import FrontEndOptions, Matcher, with_matcher
 from groundfuse.tools.overlap import true_overlap
+from groundfuse.tools.pair_verdict import Seen, compare, look, odometry_gate, swayed
 from groundfuse.tools.robot import Frame, Odometry, Robot
+from groundfuse.tools.store import Store
+from groundfuse.tools.workers import AHEAD, Threads, in_threads
 
 BARREL = (-0.2, 0.05, 1e-3, -8e-4, 0.0)
 CAMERAS = {
@@ -87,11 +80,11 @@ def silent(items, total, title):  # noqa: ARG001
     return items
 
 
-def run(robots, *, options=OPTIONS, workers=1, progress=silent):
+def run(robots, *, options=OPTIONS, workers=1, progress=silent, store=None):
     def stage(_name):
         return contextlib.nullcontext()
 
-    return run_front_end(robots, options, workers, progress, stage)
+    return run_front_end(robots, options, Threads(workers), store or Store(), progress, stage)
 
 
 @pytest.fixture(scope="module")
@@ -177,8 +170,8 @@ def test_every_pair_ends_once_and_in_order(found):
     assert all(a < b for a, b in pairs)
     for part in (found.edges, found.rejected):
         assert [(r.a, r.b) for r in part] == sorted((r.a, r.b) for r in part)
-    assert set(found.features) == set(shots())
-    assert all(f.repetition < REPEATS for f in found.features.values())
+    assert set(found.repetition) == set(shots())
+    assert all(second < REPEATS for second in found.repetition.values())
 
 
 def assert_same(one, two):
@@ -206,15 +199,39 @@ def test_an_unreadable_picture_stops_with_its_path(folder):
 def test_one_frame_is_a_team(folder):
     result = run((robot("B", folder, count=1),))
     assert (result.edges, result.rejected) == ((), ())
-    assert list(result.features) == [FrameId("B", 0)]
+    assert list(result.repetition) == [FrameId("B", 0)]
 
 
 def test_threads_keep_the_order():
-    def slow(item):
+    def work(item):
+        time.sleep(0.001 * (item % 3))
         return -item
 
     for workers in (1, 2, 4):
-        assert in_threads(slow, range(20), workers, silent, "") == [-k for k in range(20)]
+        assert list(in_threads(work, range(40), workers)) == [-k for k in range(40)]
+        assert list(in_threads(work, [], workers)) == []
+
+
+def test_threads_begin_little_ahead_and_nothing_after_the_end():
+    begun = []
+    results = in_threads(begun.append, range(1000), 2)
+    next(results)
+    results.close()
+    assert 0 < len(begun) <= 2 * AHEAD
+
+
+def test_a_failure_in_a_thread_ends_the_work():
+    begun = []
+
+    def work(item):
+        begun.append(item)
+        if item == 5:
+            raise DataError("five")
+
+    for workers in (1, 2):
+        with pytest.raises(DataError, match="five"):
+            list(in_threads(work, range(1000), workers))
+    assert len(begun) < 100
 
 
 def test_matchers_bring_what_they_need():
@@ -381,7 +398,7 @@ def test_the_gate_grows_by_what_wobble_does_to_the_middle_of_the_views(tilt_deg,
     known = Prior(cam.mount.attitude, cam.mount.sigma)
     shifts = [floor_from_rays(drawn(known, rng), axis) - still for _ in range(400)]
     both = 2.0 * np.mean(np.square(shifts).sum(axis=2))
-    wide = _swayed(Gate(Se2(0.1, 0.2, 0.3), 0.05, 0.07), seen, seen, OPTIONS)
+    wide = swayed(Gate(Se2(0.1, 0.2, 0.3), 0.05, 0.07), seen, seen, OPTIONS)
     # A mean square of 400 draws: 7 %.
     assert wide.radius_m**2 - 0.05**2 == pytest.approx(16.0 * both, rel=0.3)
     assert (wide.a_from_b, wide.turn_rad) == (Se2(0.1, 0.2, 0.3), 0.07)
@@ -408,7 +425,7 @@ def test_the_odometry_gate_is_as_wide_as_odometry_is_wrong():
     for _ in range(150):
         truth, odometry = turning_robot(rng)
         seen = [_seen("A", k, odometry) for k in (0, last)]
-        gate = _odometry_gate(*seen, OPTIONS)
+        gate = odometry_gate(*seen, OPTIONS)
         foot = mount.inverse() @ truth[0].inverse() @ truth[last] @ mount
         error = gate.a_from_b.inverse() @ foot
         places.append((error.x_m**2 + error.y_m**2) / (gate.radius_m / 4.0) ** 2)
@@ -431,10 +448,10 @@ def test_there_is_no_gate_without_odometry_all_the_way():
     def gap(k):
         return None if k == 2 else full(k)
 
-    assert _odometry_gate(_seen("A", 0, full), _seen("A", 3, full), OPTIONS) is not None
-    assert _odometry_gate(_seen("A", 0, gap), _seen("A", 1, gap), OPTIONS) is not None
-    assert _odometry_gate(_seen("A", 1, gap), _seen("A", 3, gap), OPTIONS) is None
-    assert _odometry_gate(_seen("A", 0, gap), _seen("A", 2, gap), OPTIONS) is None
-    assert _odometry_gate(_seen("A", 0, None), _seen("A", 1, None), OPTIONS) is None
+    assert odometry_gate(_seen("A", 0, full), _seen("A", 3, full), OPTIONS) is not None
+    assert odometry_gate(_seen("A", 0, gap), _seen("A", 1, gap), OPTIONS) is not None
+    assert odometry_gate(_seen("A", 1, gap), _seen("A", 3, gap), OPTIONS) is None
+    assert odometry_gate(_seen("A", 0, gap), _seen("A", 2, gap), OPTIONS) is None
+    assert odometry_gate(_seen("A", 0, None), _seen("A", 1, None), OPTIONS) is None
     both = driven(PATHS["B"], sigma)
-    assert _odometry_gate(_seen("A", 0, full), _seen("B", 1, both), OPTIONS) is None
+    assert odometry_gate(_seen("A", 0, full), _seen("B", 1, both), OPTIONS) is None

@@ -30,6 +30,7 @@ from groundfuse.frontend.overhead import floor_from_rays
 from groundfuse.tools import fuse_team
 from groundfuse.tools.fuse_team import SAMPLE, RunOptions
 from groundfuse.tools.settings import record
+from groundfuse.tools.store import Store
 from groundfuse.tools.team_folder import read_team
 
 ROOT = Path(__file__).parents[1]
@@ -361,7 +362,7 @@ def test_the_same_bytes_whatever_the_workers_and_the_hash_seed(pair, tmp_path):
     assert not (tmp_path / "asked").exists()
     names = {p.name for p in pair.out.iterdir()}
     assert {p.name for p in again.out.iterdir()} == names
-    for name in sorted(names - {"report.txt"}):
+    for name in sorted(names - {"report.txt", "store.sqlite"}):  # both hold times
         assert (again.out / name).read_bytes() == (pair.out / name).read_bytes(), name
     timeless = [r.report.splitlines()[:-1] for r in (pair, again)]
     assert timeless[0] == timeless[1]
@@ -421,6 +422,44 @@ def test_the_other_matchers_give_a_map(tmp_path, matcher):
     assert len(poses) == len(edges) == 3
     # Three small views at full resolution; worst over seeds 1 to 5 4.0 mm (fast), 0.9 mm (paper).
     assert misplaced_m(poses, painted_truth(members)) < 0.012
+
+
+# The store
+
+
+def same_but(ran, other, but=("report.txt", "store.sqlite", "store.sqlite.lock")):
+    """Whether two out folders hold the same bytes."""
+    names = {p.name for p in other.out.iterdir()} - {*but}
+    assert {p.name for p in ran.out.iterdir()} - {*but} == names
+    for name in sorted(names):
+        assert (ran.out / name).read_bytes() == (other.out / name).read_bytes(), name
+
+
+def test_a_second_run_takes_what_is_known_and_ends_the_same(pair, tmp_path):
+    out, store = tmp_path / "out", tmp_path / "elsewhere" / "known.sqlite"
+    kept = ("--store", str(store))
+    first = run(painted_pair(), out, *kept)
+    assert "from the store" not in first.report
+    assert not (out / "store.sqlite").exists()
+    same_but(first, pair)
+    again = run(painted_pair(), out, *kept)
+    assert "\nfrom the store: 7 of 7 pictures, 21 of 21 pairs\n" in again.report
+    assert (again.code, again.stderr) == (0, "")
+    same_but(again, pair)
+    fresh = run(painted_pair(), out, *kept, *NUMBERS_ONLY, "--fresh")
+    assert "from the store" not in fresh.report
+
+
+def test_a_store_that_is_in_use_or_foreign_is_one_line(tmp_path):
+    out = tmp_path / "out"
+    with Store(out / "store.sqlite"):
+        line = refused(run(painted_pair(), out))
+    assert line.startswith(f"{out}/store.sqlite: store is held by process {os.getpid()} on ")
+    foreign = tmp_path / "notes.txt"
+    foreign.write_text("mine")
+    line = refused(run(painted_pair(), out, "--store", str(foreign), "--fresh"))
+    assert line == f"{foreign}: not a store of groundfuse"
+    assert foreign.read_text() == "mine"
 
 
 # Shapes of teams

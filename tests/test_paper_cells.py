@@ -8,7 +8,7 @@ import pytest
 from groundfuse.backend.measurement import Attitude
 from groundfuse.frontend.camera import Camera, Intrinsics, Mount
 from groundfuse.frontend.overhead_view import raster_cell_m
-from groundfuse.tools.front_end import FrontEndOptions, Matcher, comparable, with_matcher
+from groundfuse.tools.front_end_options import FrontEndOptions, Matcher, comparable, with_matcher
 from groundfuse.tools.robot import Robot
 
 

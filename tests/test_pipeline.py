@@ -167,7 +167,7 @@ def test_two_painted_robots_become_one_map(painted):
     assert list(watch.seconds) == ["features", "retrieval", "pairs", "graphs", "bundle"]
     assert isinstance(fused.bundled, BundleEstimate)
     frames = {FrameId(n, k) for n, m in PAIR.items() for k in range(len(m.poses))}
-    assert set(fused.best.team_from_base) == set(fused.front_end.features) == frames
+    assert set(fused.best.team_from_base) == set(fused.front_end.repetition) == frames
     assert set(fused.best.component_of.values()) == {0}
     truth = {FrameId(n, k): p for n, m in PAIR.items() for k, p in enumerate(m.poses)}
     for estimate in (fused.team, fused.best):

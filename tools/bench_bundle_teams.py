@@ -11,7 +11,6 @@ from groundfuse.backend.drift import accuracy
 from groundfuse.backend.measurement import Attitude, FrameId, Se2, TeamEstimate
 from groundfuse.frontend.camera import Camera
 from groundfuse.tools.errors import TeamError
-from groundfuse.tools.front_end import Result
 from groundfuse.tools.pipeline import (
     Fused,
     PipelineOptions,
@@ -20,6 +19,7 @@ from groundfuse.tools.pipeline import (
     fuse_robots,
 )
 from groundfuse.tools.robot import Robot
+from groundfuse.tools.workers import Result
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

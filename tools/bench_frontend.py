@@ -27,18 +27,12 @@ from groundfuse.frontend.camera import Camera, Intrinsics, Mount
 from groundfuse.frontend.repetition import REPEATS
 from groundfuse.tools import render_team
 from groundfuse.tools.drift_table import drift_record
-from groundfuse.tools.front_end import (
-    FrontEndOptions,
-    Matcher,
-    Result,
-    Seen,
-    compare,
-    look,
-    with_matcher,
-)
+from groundfuse.tools.front_end_options import FrontEndOptions, Matcher, with_matcher
+from groundfuse.tools.pair_verdict import Seen, compare, look
 from groundfuse.tools.pipeline import PipelineOptions, Stopwatch, fuse_robots
 from groundfuse.tools.robot import Frame, Robot
 from groundfuse.tools.team_folder import read_team
+from groundfuse.tools.workers import Result
 from groundfuse.tools.world import RenderedFrame, RenderedTeam, RobotSpec, make_team
 
 RIGHT_M, RIGHT_RAD = 0.030, math.radians(3.0)

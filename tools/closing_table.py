@@ -139,7 +139,7 @@ def _warning_lines(fused: Fused) -> list[str]:
     repeating = fused.repeating
     if not repeating:
         return []
-    count = f"{len(repeating)} of {len(fused.front_end.features)} frames"
+    count = f"{len(repeating)} of {len(fused.front_end.repetition)} frames"
     ambiguous = sum(r.reason is Reason.AMBIGUOUS for r in fused.front_end.rejected)
     lines = [f"THE FLOOR REPEATS itself in {count}, first in {repeating[0]}"]
     if ambiguous:

@@ -20,7 +20,7 @@ HELP = {
 """What a user can do something about, by error number."""
 
 
-def _refusal(path: Path, error: OSError) -> DataError:
+def refusal(path: Path, error: OSError) -> DataError:
     """Return the one line that says why `path` can't be written."""
     why = HELP.get(error.errno or 0, error.strerror or str(error))
     return DataError(f"{path}: cannot write: {why}")
@@ -49,7 +49,7 @@ def make_folder(folder: Path) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise _refusal(folder, error) from error
+        raise refusal(folder, error) from error
     return folder
 
 
@@ -71,6 +71,6 @@ def write_atomic(path: Path, data: bytes | str) -> None:
             os.fsync(stream.fileno())
         part.replace(path)
     except OSError as error:
-        raise _refusal(path, error) from error
+        raise refusal(path, error) from error
     finally:
         part.unlink(missing_ok=True)

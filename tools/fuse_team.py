@@ -22,11 +22,12 @@ from groundfuse.backend.bundle_estimate import BundleEstimate
 from groundfuse.frontend.mosaic import MosaicOptions
 from groundfuse.tools.calibration_file import write_calibrations
 from groundfuse.tools.closing_table import closing_table
+from groundfuse.tools.code_version import libraries
 from groundfuse.tools.drift_table import drift_record
 from groundfuse.tools.errors import TeamError
 from groundfuse.tools.files import make_folder, write_atomic
 from groundfuse.tools.floor_check import check_floor
-from groundfuse.tools.front_end import Matcher, Result, with_matcher
+from groundfuse.tools.front_end_options import Matcher, with_matcher
 from groundfuse.tools.open3d_check import check_with_open3d
 from groundfuse.tools.outputs import (
     check_names,
@@ -50,9 +51,12 @@ from groundfuse.tools.pipeline import (
     Stopwatch,
     fuse_robots,
 )
+from groundfuse.tools.robot import Robot
 from groundfuse.tools.settings import record, with_settings
+from groundfuse.tools.store import STORE, Store
 from groundfuse.tools.team_folder import list_robots, read_team
 from groundfuse.tools.view3d import view_ply, write_ply
+from groundfuse.tools.workers import Result
 
 log = logging.getLogger(__name__)
 SAMPLE = Path(__file__).resolve().parent.parent / "data" / "team"
@@ -105,6 +109,8 @@ def parser() -> argparse.ArgumentParser:
     )
     cores = os.cpu_count() or 1
     add("--workers", type=int, default=cores, metavar="N", help="threads (all cores)")
+    add("--store", type=Path, metavar="FILE", help="what was computed (store.sqlite in the out)")
+    add("--fresh", action="store_true", help="start over: empty the store first")
     add("--no-bundle", action="store_true", help="stop at the Pose2 graph")
     add("--no-mosaic", action="store_true", help="leave out mosaic, location graph and 3D file")
     add("--cell", type=float, metavar="METRES", help="side of a mosaic cell (from the pictures)")
@@ -149,11 +155,32 @@ def run(asked: argparse.Namespace) -> Fused:
         check_floor(robots, options.front_end.features.overhead)
         out = make_folder(asked.out)
         write_json(out / "options.json", record(options))
-    bar = _Bar(asked.quiet)
-    fused = fuse_robots(robots, options, asked.workers, bar, watch, bundled=not asked.no_bundle)
+    with Store(asked.store or out / STORE, fresh=asked.fresh) as store:
+        store.begin(record(options), libraries())
+        fused = _fused(asked, out, robots, options, store, watch)
+    print(f"everything is in {out}")
+    others = files_before(out, begin_s)
+    if others:
+        log.warning("%s: not of this run: %s", out, ", ".join(others))
+    if asked.view:
+        view_ply(out / "team.ply")
+    return fused
+
+
+def _fused(
+    asked: argparse.Namespace,
+    out: Path,
+    robots: Sequence[Robot],
+    options: RunOptions,
+    store: Store,
+    watch: Stopwatch,
+) -> Fused:
+    """Fuse and write everything down."""
+    bar, bundled = _Bar(asked.quiet), not asked.no_bundle
+    fused = fuse_robots(robots, options, asked.workers, bar, watch, bundled=bundled, store=store)
     drift = drift_record(fused)
     _write_numbers(out, fused, drift, watch)
-    notes: list[str] = []
+    notes = [fused.front_end.reused.line()]
     try:
         _write_pictures(asked, out, fused, options, watch)
         if asked.check:
@@ -161,15 +188,9 @@ def run(asked: argparse.Namespace) -> Fused:
                 notes.append(_second_opinion(fused))
     finally:  # a picture that fails late doesn't cost the numbers
         table = closing_table(fused, drift, watch.seconds)
-        table += "".join(f"{note}\n" for note in notes)
+        table += "".join(f"{note}\n" for note in notes if note)
         write_atomic(out / "report.txt", table)
         print(table, end="")
-    print(f"everything is in {out}")
-    others = files_before(out, begin_s)
-    if others:
-        log.warning("%s: not of this run: %s", out, ", ".join(others))
-    if asked.view:
-        view_ply(out / "team.ply")
     return fused
 
 

@@ -5,7 +5,10 @@ OpenCV would fill with grey without a word, but not bytes that were damaged in t
 hold any characters: the bytes are read here, `cv2.imread` never sees a name.
 """
 
+import io
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
@@ -34,26 +37,45 @@ def image_size(path: Path) -> tuple[int, int]:
         DataError: not a readable JPEG, PNG or TIFF, or cut short.
     """
     try:
-        with path.open("rb") as stream:
+        with path.open("rb") as stream, _told(path):
             return _size(stream, path.stat().st_size)
     except OSError as error:
         raise DataError(f"{path}: cannot read: {error.strerror}") from error
+
+
+@contextmanager
+def _told(path: Path) -> Iterator[None]:
+    try:
+        yield
     except (ValueError, struct.error) as error:
         why = "the head is cut short" if isinstance(error, struct.error) else error
         raise DataError(f"{path}: not a whole picture: {why}") from error
 
 
-def read_image(path: Path) -> Image:
-    """Return the picture as (rows, columns, 3) BGR uint8, as the sensor saw it.
+def read_bytes(path: Path) -> bytes:
+    """Return a file's bytes (DataError: unreadable)."""
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise DataError(f"{path}: cannot read: {error.strerror}") from error
+
+
+def decoded_image(data: bytes, path: Path) -> Image:
+    """Return the picture in a file's bytes as (rows, columns, 3) BGR uint8, as the sensor saw it.
 
     Grey is repeated, alpha dropped, 16 bits scaled to 8 over the full range (0..65535). A rotation
     in the EXIF data is not carried out: intrinsics belong to the sensor.
 
+    Args:
+        data: content of the file.
+        path: its name, for messages.
+
     Raises:
-        DataError: unreadable, cut short, or neither 8 nor 16 bits a channel.
+        DataError: cut short, or neither 8 nor 16 bits a channel.
     """
-    image_size(path)
-    decoded = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    with _told(path):
+        _size(io.BytesIO(data), len(data))
+    decoded = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     if decoded is None:
         raise DataError(f"{path}: not a whole picture: it can't be decoded")
     picture = np.asarray(decoded)

@@ -50,8 +50,11 @@ def check_names(robots: Iterable[str]) -> None:
 
 
 def files_before(out: Path, begin_s: float) -> list[str]:
-    """Return the files that were there already and have not been written since a time."""
-    files = (path for path in out.iterdir() if path.is_file())
+    """Return the files that were there already and have not been written since a time.
+
+    Stores and their locks outlast runs.
+    """
+    files = (path for path in out.iterdir() if path.is_file() and ".sqlite" not in path.name)
     return sorted(path.name for path in files if path.stat().st_mtime < begin_s)
 
 

@@ -1,9 +1,10 @@
 """The main job, stage by stage: pictures, pairs, robots' graphs, the team, the planar bundle."""
 
+import logging
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from groundfuse.backend.bundle_estimate import (
     BundleEstimate,
     BundleOptions,
     BundleRefusal,
+    MountEstimate,
 )
 from groundfuse.backend.graph import RobotEstimate, robot_estimate
 from groundfuse.backend.measurement import (
@@ -24,8 +26,15 @@ from groundfuse.backend.measurement import (
 )
 from groundfuse.backend.team import TeamOptions, fuse
 from groundfuse.frontend.repetition import REPEATS
-from groundfuse.tools.front_end import FrontEndOptions, FrontEndResult, Progress, run_front_end
+from groundfuse.tools.focal_gain import focal_gains
+from groundfuse.tools.front_end import FrontEndResult, run_front_end
+from groundfuse.tools.front_end_options import FrontEndOptions
 from groundfuse.tools.robot import Frame, Robot
+from groundfuse.tools.second_look import as_filed, corrected, is_worth_it
+from groundfuse.tools.store import Store
+from groundfuse.tools.workers import Progress, Threads, Workers
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,11 +45,14 @@ class PipelineOptions:
         front_end: pictures to relative poses.
         team: relative poses to one map.
         bundle: attitudes, mounts and poses from all correspondences at once.
+        more_looks: where the bundle finds a camera file wrong, match and fuse again with the
+            corrected file, this often at most.
     """
 
     front_end: FrontEndOptions = field(default_factory=FrontEndOptions)
     team: TeamOptions = field(default_factory=TeamOptions)
     bundle: BundleOptions = field(default_factory=BundleOptions)
+    more_looks: int = 2
 
 
 @dataclass(slots=True)
@@ -59,12 +71,24 @@ class Stopwatch:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
 
 
+@dataclass(frozen=True, slots=True)
+class Means:
+    """What a run works with: who, with what is known already, and who is told about it."""
+
+    workers: Workers
+    store: Store
+    progress: Progress
+    watch: Stopwatch
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Fused:
     """Everything the main job found.
 
     Attributes:
         robots: the input.
+        cameras: the robots with the cameras that the pictures were looked at with: the input's, or
+            corrected ones.
         front_end: edges, rejected pairs, features.
         edges: the edges that the graphs were given: the front-end's and odometry's.
         alone: every robot by itself: chained and optimised.
@@ -73,6 +97,7 @@ class Fused:
     """
 
     robots: tuple[Robot, ...]
+    cameras: tuple[Robot, ...]
     front_end: FrontEndResult
     edges: tuple[RelativePose, ...]
     alone: dict[str, RobotEstimate]
@@ -86,8 +111,8 @@ class Fused:
 
     @property
     def frames(self) -> dict[FrameId, tuple[Robot, Frame]]:
-        """All frames with their robots."""
-        return {frame.id: (robot, frame) for robot in self.robots for frame in robot.frames}
+        """All frames with their robots, at the best known cameras."""
+        return {frame.id: (robot, frame) for robot in self.cameras for frame in robot.frames}
 
     def attitude(self, frame: FrameId) -> Attitude:
         """Return the best known attitude of a frame."""
@@ -98,8 +123,8 @@ class Fused:
     @property
     def repeating(self) -> list[FrameId]:
         """Frames whose floor repeats itself."""
-        features = self.front_end.features
-        return [frame for frame in sorted(features) if features[frame].repetition > REPEATS]
+        repetition = self.front_end.repetition
+        return [frame for frame in sorted(repetition) if repetition[frame] > REPEATS]
 
 
 def fuse_robots(
@@ -110,9 +135,57 @@ def fuse_robots(
     watch: Stopwatch,
     *,
     bundled: bool = True,
+    store: Store | None = None,
+    workers: Workers | None = None,
 ) -> Fused:
-    """Run the stages from pictures to the fused team."""
-    found = run_front_end(robots, options.front_end, num_workers, progress, watch.stage)
+    """Run the stages from pictures to the fused team, again where that mends a camera file.
+
+    Args:
+        robots: the team.
+        options: see `PipelineOptions`.
+        num_workers: threads.
+        progress: shows how far it is.
+        watch: takes the time of each stage.
+        bundled: with the planar bundle.
+        store: what was computed before, and takes what is computed now; memory where there is none.
+        workers: what works instead of threads of this process.
+
+    Raises:
+        DataError: a picture can't be read, or the store can't be written.
+    """
+    robots = tuple(robots)
+    means = Means(workers or Threads(num_workers), store or Store(), progress, watch)
+    fused = _looked(robots, robots, (), options, means, bundled=bundled)
+    assumed: Sequence[MountEstimate] = ()
+    for _ in range(options.more_looks):
+        found = fused.bundled
+        if not isinstance(found, BundleEstimate) or not is_worth_it(robots, assumed, found.mounts):
+            break
+        log.info("the pictures contradict a camera file: matching again with what they say")
+        assumed, better = found.mounts, corrected(robots, found.mounts)
+        again = _looked(robots, better, assumed, options, means)
+        if not isinstance(again.bundled, BundleEstimate):
+            break
+        fused = again
+    if isinstance(fused.bundled, BundleEstimate):
+        return replace(fused, cameras=corrected(robots, fused.bundled.mounts))
+    return fused
+
+
+def _looked(
+    robots: tuple[Robot, ...],
+    cameras: tuple[Robot, ...],
+    mounts: Sequence[MountEstimate],
+    options: PipelineOptions,
+    means: Means,
+    *,
+    bundled: bool = True,
+) -> Fused:
+    """Match with these cameras, which are `mounts` off the files, and fuse."""
+    store, watch = means.store, means.watch
+    found = run_front_end(
+        cameras, options.front_end, means.workers, store, means.progress, watch.stage
+    )
     edges = (*found.edges, *odometry_edges(robots))
     frames = [frame.id for robot in robots for frame in robot.frames]
     with watch.stage("graphs"):
@@ -121,8 +194,9 @@ def fuse_robots(
     refined: BundleEstimate | BundleRefusal | None = None
     if bundled:
         with watch.stage("bundle"):
-            refined = _bundled(robots, team, edges, options.bundle)
-    return Fused(tuple(robots), found, edges, alone, team, refined)
+            accepted = as_filed(accepted_edges(team, edges), robots, mounts)
+            refined = _bundled(robots, team, accepted, options.bundle)
+    return Fused(robots, cameras, found, edges, alone, team, refined)
 
 
 def odometry_edges(robots: Sequence[Robot]) -> tuple[RelativePose, ...]:
@@ -175,8 +249,10 @@ def _bundled(
     sigma: Mapping[FrameId, Attitude] = {frame.id: frame.sigma for frame in frames}
     cameras = {
         robot.name: BundleCamera(
-            robot.camera.mount.base_from_foot, robot.camera.intrinsics.focal_px
+            robot.camera.mount.base_from_foot,
+            robot.camera.intrinsics.focal_px,
+            focal_gains(robot.camera.intrinsics),
         )
         for robot in robots
     }
-    return bundle(team, accepted_edges(team, edges), prior, sigma, cameras, options)
+    return bundle(team, edges, prior, sigma, cameras, options)

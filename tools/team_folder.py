@@ -16,7 +16,7 @@ from groundfuse.frontend.arrays import Image
 from groundfuse.frontend.camera import Camera
 from groundfuse.tools.checks import nearest
 from groundfuse.tools.errors import DataError
-from groundfuse.tools.image_file import read_image
+from groundfuse.tools.image_file import decoded_image, read_bytes
 from groundfuse.tools.robot import Frame, Odometry, Robot
 from groundfuse.tools.robot_folder import (
     IMAGES,
@@ -26,7 +26,7 @@ from groundfuse.tools.robot_folder import (
     visible_entries,
 )
 
-__all__ = ["Frame", "Odometry", "Robot", "list_robots", "load_image", "read_team"]
+__all__ = ["Frame", "Odometry", "Robot", "image_of", "list_robots", "load_image", "read_team"]
 
 
 def list_robots(folder: Path) -> tuple[str, ...]:
@@ -68,7 +68,12 @@ def load_image(frame: Frame, camera: Camera) -> Image:
     Raises:
         DataError: unreadable, cut short, or not of the camera's size.
     """
-    picture = read_image(frame.path)
+    return image_of(read_bytes(frame.path), frame, camera)
+
+
+def image_of(data: bytes, frame: Frame, camera: Camera) -> Image:
+    """Return the picture of a frame from its file's bytes; see `load_image`."""
+    picture = decoded_image(data, frame.path)
     rows, columns = picture.shape[:2]
     check_size(frame.path, (columns, rows), camera)
     return picture

@@ -1,0 +1,188 @@
+"""Values as bytes: plain numbers, words, arrays and the project's own dataclasses, never code.
+
+    checksum (8) | length of the outline (4, little endian) | outline (JSON) | arrays, 64-byte steps
+
+The outline holds the value's shape; each array stands in it as its type, its shape and where its
+raw bytes begin. Equal values give equal bytes, so that the bytes also serve as keys; an array comes
+back in C order and in memory of its own, so that what is computed from a value that was put away
+is the same to the bit as from one that was not, if both went this way.
+"""
+
+import enum
+import functools
+import hashlib
+import importlib
+import itertools
+import json
+import math
+import struct
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+import numpy as np
+
+CHECKSUM_BYTES = 8
+STEP_BYTES = 64
+OURS = "groundfuse."
+
+
+class DamagedError(ValueError):
+    """Bytes that were not packed here, or have changed since."""
+
+
+def packed(value: object) -> bytes:
+    """Return a value as bytes.
+
+    Raises:
+        TypeError: something in it is none of ours.
+    """
+    arrays = _Arrays()
+    outline = json.dumps(_outline(value, arrays), separators=(",", ":")).encode()
+    start = _after(4 + len(outline))
+    lead = struct.pack("<I", len(outline)) + outline + bytes(start - 4 - len(outline))
+    body = b"".join([lead, *arrays.parts])
+    return _checksum(body) + body
+
+
+def unpacked(data: bytes) -> Any:  # noqa: ANN401
+    """Return the value.
+
+    Raises:
+        DamagedError: the checksum is wrong, or the bytes name what is not known.
+    """
+    if not is_whole(data):
+        raise DamagedError(f"{len(data)} bytes with a wrong checksum")
+    body = memoryview(data)[CHECKSUM_BYTES:]
+    (length,) = struct.unpack("<I", body[:4])
+    try:
+        return _value(json.loads(bytes(body[4 : 4 + length])), body[_after(4 + length) :])
+    except (KeyError, TypeError, ValueError) as error:
+        raise DamagedError(f"{len(data)} bytes that are no value: {error}") from error
+
+
+def is_whole(data: object) -> bool:
+    """Return whether bytes were packed here and have not changed since."""
+    if not isinstance(data, bytes) or len(data) < CHECKSUM_BYTES + 4:
+        return False
+    return _checksum(memoryview(data)[CHECKSUM_BYTES:]) == data[:CHECKSUM_BYTES]
+
+
+def key_of(*parts: object) -> bytes:
+    """Return 20 bytes that stand for values: equal for equal values only."""
+    return hashlib.blake2b(packed(parts), digest_size=20).digest()
+
+
+def digest_of(data: bytes) -> bytes:
+    """Return 20 bytes that stand for a file's content."""
+    return hashlib.blake2b(data, digest_size=20).digest()
+
+
+class _Arrays:
+    """Raw arrays, one after the other."""
+
+    def __init__(self) -> None:
+        self.parts: list[bytes] = []
+        self._length = 0
+
+    def add(self, array: np.ndarray[Any, Any]) -> int:
+        """Return where the array begins."""
+        start, raw = self._length, np.ascontiguousarray(array).tobytes()
+        self.parts += [raw, bytes(_after(len(raw)) - len(raw))]
+        self._length += _after(len(raw))
+        return start
+
+
+def _checksum(body: bytes | memoryview) -> bytes:
+    return hashlib.blake2b(body, digest_size=CHECKSUM_BYTES).digest()
+
+
+def _after(length: int) -> int:
+    return -(-length // STEP_BYTES) * STEP_BYTES
+
+
+def _outline(value: object, arrays: _Arrays) -> Any:  # noqa: ANN401
+    """Return a value as JSON has it; lists begin with a letter for what they are."""
+    if isinstance(value, enum.Enum):
+        return ["E", _name(value), value.value]
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, np.ndarray):
+        return ["A", value.dtype.str, list(value.shape), arrays.add(value)]
+    if isinstance(value, bytes):
+        return ["B", value.hex()]
+    return [*_lead(value), *(_outline(part, arrays) for part in _parts(value))]
+
+
+def _lead(value: object) -> list[str]:
+    if isinstance(value, Mapping):
+        return ["D"]
+    if isinstance(value, tuple | list) and not hasattr(value, "_fields"):
+        return ["T"]
+    return ["O", _name(value)]
+
+
+def _name(value: object) -> str:
+    """Return where a value's class lies: `frontend.fit:Prior`."""
+    kind = type(value)
+    if not kind.__module__.startswith(OURS):
+        raise TypeError(f"a {kind.__name__} can't be packed")
+    return f"{kind.__module__.removeprefix(OURS)}:{kind.__name__}"
+
+
+@functools.cache
+def _kind(name: str) -> Callable[..., Any]:
+    """Return a class by that name: one of ours that only holds values, and nothing else."""
+    module, _, word = name.partition(":")
+    try:
+        kind = vars(importlib.import_module(OURS + module))[word]
+    except (ImportError, KeyError) as error:
+        raise ValueError(f"there is no {name}") from error
+    if not isinstance(kind, type) or not (
+        is_dataclass(kind) or issubclass(kind, enum.Enum) or hasattr(kind, "_fields")
+    ):
+        raise ValueError(f"{name} does not hold values")
+    return kind
+
+
+def _parts(value: object) -> Iterable[object]:
+    if isinstance(value, Mapping):
+        return itertools.chain.from_iterable(value.items())
+    if isinstance(value, tuple | list):
+        return value
+    if is_dataclass(value):
+        return (getattr(value, field.name) for field in fields(value))
+    raise TypeError(f"a {type(value).__name__} can't be packed")
+
+
+def _value(outline: Any, arrays: memoryview) -> Any:  # noqa: ANN401, PLR0911
+    """Return what an outline describes; sequences come back as tuples."""
+    if not isinstance(outline, list):
+        return outline
+    kind, *parts = outline
+    if kind == "A":
+        return _array(arrays, *parts)
+    if kind == "B":
+        return bytes.fromhex(parts[0])
+    if kind == "E":
+        return _kind(parts[0])(parts[1])
+    if kind == "O":
+        return _kind(parts[0])(*(_value(part, arrays) for part in parts[1:]))
+    inner = [_value(part, arrays) for part in parts]
+    if kind == "D":
+        return dict(zip(inner[::2], inner[1::2], strict=True))
+    if kind == "T":
+        return tuple(inner)
+    raise ValueError(f"there is no kind {kind!r}")
+
+
+def _array(arrays: memoryview, kind: str, shape: list[int], start: int) -> np.ndarray[Any, Any]:
+    dtype = np.dtype(kind)
+    if dtype.kind not in "biufc":
+        raise ValueError(f"arrays of {kind} are not known")
+    count = math.prod(shape)
+    if count == 0:
+        return np.zeros(shape, dtype)
+    return np.frombuffer(arrays, dtype, count, start).reshape(shape).copy()

@@ -1,0 +1,200 @@
+"""One file per team that keeps what was computed, by what it was computed from.
+
+Every entry's key is a digest of all that its value depends on: pictures, calibration, options,
+code. So nothing in a store is ever out of date: what is new has a new key and is computed, what is
+not is found. SQLite's log makes each entry whole or absent whenever the process is killed; every
+`SYNC_S` seconds all is forced to the disk, so that a power cut costs no more than that.
+"""
+
+import contextlib
+import json
+import logging
+import sqlite3
+import threading
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from groundfuse.tools.errors import DataError
+from groundfuse.tools.packing import is_whole, unpacked
+from groundfuse.tools.store_lock import Lock
+
+log = logging.getLogger(__name__)
+STORE = "store.sqlite"
+"""Its usual name, in the out folder."""
+APPLICATION = 0x67667573  # "gfus"
+VERSION = 1
+SYNC_S = 5.0
+MAGIC = b"SQLite format 3\0"
+TABLES = """
+CREATE TABLE run(
+    id INTEGER PRIMARY KEY, begun TEXT NOT NULL, options TEXT NOT NULL, versions TEXT NOT NULL);
+CREATE TABLE entry(
+    id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, kind TEXT NOT NULL, label TEXT NOT NULL,
+    run INTEGER REFERENCES run(id), value BLOB NOT NULL);
+"""
+
+
+class Store:
+    """A store that this process holds; without a path it lives in memory and ends with it.
+
+    Raises:
+        DataError: another run holds it, it is of another version or damaged, or no store at all.
+    """
+
+    def __init__(self, path: Path | None = None, *, fresh: bool = False) -> None:
+        self.path = path
+        self._guard = threading.RLock()
+        self._run: int | None = None
+        self._synced_s = time.monotonic()
+        self._lock = None if path is None else Lock(path.with_name(f"{path.name}.lock"))
+        try:
+            if path is not None and path.exists():
+                _check_head(path)
+                if fresh:
+                    _remove(path)
+            with self._told():
+                self._base = _opened(path)
+        except BaseException:
+            if self._lock is not None:
+                self._lock.release()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Put everything into the one file and let others have it."""
+        with self._guard, contextlib.suppress(sqlite3.Error):
+            self._base.close()
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
+
+    def begin(self, options: object, versions: object) -> None:
+        """Note what the entries that follow are made with.
+
+        Raises:
+            DataError: the disk is full, or fails.
+        """
+        row = (time.strftime("%Y-%m-%dT%H:%M:%S%z"), json.dumps(options), json.dumps(versions))
+        with self._told(), self._guard:
+            insert = "INSERT INTO run(begun, options, versions) VALUES (?, ?, ?)"
+            self._run = self._base.execute(insert, row).lastrowid
+
+    def known(self, keys: Iterable[bytes]) -> set[bytes]:
+        """Return the keys that have an entry."""
+        find = "SELECT 1 FROM entry WHERE key = ?"
+        with self._told(), self._guard:
+            return {key for key in keys if self._base.execute(find, (key,)).fetchone()}
+
+    def load(self, key: bytes) -> Any:  # noqa: ANN401
+        """Return an entry's value; None where there is none, or a damaged one (which is told)."""
+        data = self.read(key)
+        return None if data is None else unpacked(data)
+
+    def read(self, key: bytes) -> bytes | None:
+        """Return an entry as it is packed; None as in `load`."""
+        find = "SELECT value, kind, label FROM entry WHERE key = ?"
+        with self._told(), self._guard:
+            row = self._base.execute(find, (key,)).fetchone()
+        if row is None:
+            return None
+        value, kind, label = row
+        if not is_whole(value):
+            log.warning("%s: %s of %s is damaged, computed anew", self.path, kind, label)
+            return None
+        data: bytes = value
+        return data
+
+    def save(self, key: bytes, kind: str, label: str, value: bytes) -> None:
+        """Keep a packed value from now on, whatever happens to the process.
+
+        Args:
+            key: digest of all that it depends on.
+            kind: what it is.
+            label: whose it is, for people.
+            value: see `packing`.
+
+        Raises:
+            DataError: the disk is full, or fails; what is there already stays.
+        """
+        insert = "INSERT OR REPLACE INTO entry(key, kind, label, run, value) VALUES (?, ?, ?, ?, ?)"
+        readable = label.encode(errors="replace").decode()
+        with self._told(), self._guard:
+            self._base.execute(insert, (key, kind, readable, self._run, value))
+            if time.monotonic() - self._synced_s > SYNC_S:
+                self._base.execute("PRAGMA wal_checkpoint(PASSIVE)")
+                self._synced_s = time.monotonic()
+
+    @contextmanager
+    def _told(self) -> Iterator[None]:
+        """Turn SQLite's complaints into the one line."""
+        try:
+            yield
+        except sqlite3.DatabaseError as error:
+            code = error.sqlite_errorcode & 0xFF if hasattr(error, "sqlite_errorcode") else 0
+            why = {
+                sqlite3.SQLITE_FULL: "no space left on the disk; what is stored stays",
+                sqlite3.SQLITE_IOERR: "the disk fails or is full; what is stored stays",
+                sqlite3.SQLITE_READONLY: "no permission to write here",
+                sqlite3.SQLITE_CANTOPEN: "cannot be opened",
+                sqlite3.SQLITE_CORRUPT: "the store is damaged, start over with --fresh",
+                sqlite3.SQLITE_NOTADB: "the store is damaged, start over with --fresh",
+            }.get(code, str(error))
+            raise DataError(f"{self.path}: {why}") from error
+
+
+def _opened(path: Path | None) -> sqlite3.Connection:
+    name = ":memory:" if path is None else str(path)
+    base = sqlite3.connect(name, isolation_level=None, check_same_thread=False)
+    try:
+        # One process at a time, so no shared memory; entries are large, so are pages and the log.
+        for setting in ("locking_mode=EXCLUSIVE", "page_size=16384", "synchronous=NORMAL"):
+            base.execute(f"PRAGMA {setting}")
+        (found,) = base.execute("PRAGMA user_version").fetchone()
+        _check_version(path, found)
+        if found == 0:  # before there is a log: a killed process must leave nothing or a store
+            head = f"PRAGMA application_id={APPLICATION}; PRAGMA user_version={VERSION};"
+            base.executescript(f"BEGIN; {TABLES} {head} COMMIT;")
+        base.execute("PRAGMA journal_mode=WAL")
+        base.execute("PRAGMA wal_autocheckpoint=4096")
+    except BaseException:
+        base.close()
+        raise
+    return base
+
+
+def _check_version(path: Path | None, found: int) -> None:
+    if found not in (0, VERSION):
+        raise DataError(
+            f"{path}: store of version {found}, this groundfuse reads {VERSION}: "
+            "use the groundfuse that wrote it, or start over with --fresh"
+        )
+
+
+def _check_head(path: Path) -> None:
+    """Refuse, and so never remove, a file that isn't ours (DataError)."""
+    if not path.is_file():
+        raise DataError(f"{path}: is a folder, needed a file for the store")
+    with path.open("rb") as stream:
+        head = stream.read(100)
+    ours = head[68:72] == APPLICATION.to_bytes(4, "big")
+    if head and not (head.startswith(MAGIC) and ours):
+        raise DataError(f"{path}: not a store of groundfuse")
+
+
+def _remove(path: Path) -> None:
+    for suffix in ("", "-wal", "-shm", "-journal"):
+        path.with_name(path.name + suffix).unlink(missing_ok=True)

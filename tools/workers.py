@@ -1,0 +1,90 @@
+"""Who does the work: threads of this process, and what stands in their place on a cluster."""
+
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Protocol, TypeVar
+
+from groundfuse.tools.frame_look import LookJob, look_done, picture_of
+from groundfuse.tools.front_end_options import FrontEndOptions
+from groundfuse.tools.pair_verdict import PairJob, pair_done
+from groundfuse.tools.shelf import Shelf
+
+AHEAD = 4
+"""Items begun per thread before the first is taken."""
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+class Progress(Protocol):
+    """Passes items on while it shows how many of them are done."""
+
+    def __call__(self, items: Iterable[Result], total: int, title: str) -> Iterable[Result]:
+        """Return the items."""
+        ...
+
+
+class Workers(Protocol):
+    """Carry out work orders; whoever does it, the bytes are the same."""
+
+    def look(
+        self, jobs: Sequence[LookJob], options: FrontEndOptions
+    ) -> Generator[tuple[LookJob, bytes], None, None]:
+        """Yield each order with what was found, packed, in any order, as it comes."""
+        ...
+
+    def compare(
+        self, jobs: Sequence[PairJob], shelf: Shelf, options: FrontEndOptions
+    ) -> Generator[tuple[PairJob, bytes], None, None]:
+        """Yield each order with its verdict, packed, in any order, as it comes."""
+        ...
+
+
+class Threads:
+    """Threads of this process: OpenCV and numpy let go of the interpreter's lock."""
+
+    def __init__(self, num_threads: int) -> None:
+        self.num_threads = num_threads
+
+    def look(
+        self, jobs: Sequence[LookJob], options: FrontEndOptions
+    ) -> Generator[tuple[LookJob, bytes], None, None]:
+        """Look at pictures."""
+        return in_threads(
+            lambda job: (job, look_done(picture_of(job), job, options)), jobs, self.num_threads
+        )
+
+    def compare(
+        self, jobs: Sequence[PairJob], shelf: Shelf, options: FrontEndOptions
+    ) -> Generator[tuple[PairJob, bytes], None, None]:
+        """Compare pairs."""
+
+        def done(job: PairJob) -> tuple[PairJob, bytes]:
+            a, b = (shelf.looked(key) for key in job.looks)
+            return job, pair_done(job, a, b, options)
+
+        return in_threads(done, jobs, self.num_threads)
+
+
+def in_threads(
+    work: Callable[[Item], Result], items: Iterable[Item], num_threads: int
+) -> Generator[Result, None, None]:
+    """Yield `work` of each item, in the order of the items, whatever the number of threads.
+
+    Few items are begun ahead of what is taken, and none after the last that is.
+    """
+    if num_threads == 1:
+        yield from map(work, items)
+        return
+    begun: deque[Future[Result]] = deque()
+    with ThreadPoolExecutor(num_threads) as pool:
+        try:
+            for item in items:
+                begun.append(pool.submit(work, item))
+                if len(begun) >= AHEAD * num_threads:
+                    yield begun.popleft().result()
+            while begun:
+                yield begun.popleft().result()
+        finally:
+            for future in begun:
+                future.cancel()
