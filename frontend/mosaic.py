@@ -28,7 +28,7 @@ from groundfuse.frontend.mosaic_plan import (
     MosaicView,
     plan_mosaic,
 )
-from groundfuse.frontend.mosaic_tile import Tile, TileStack, border_weight
+from groundfuse.frontend.mosaic_tile import Tile, TileStack, border_weight, sharpness_weight
 from groundfuse.frontend.picture_cache import PictureCache
 from groundfuse.frontend.selection import FEWEST_VIEWS
 from groundfuse.frontend.sight import sight
@@ -193,8 +193,7 @@ def _add_view(stack: TileStack, scene: _Scene, block: tuple[slice, slice], exten
     radius2 = radius_squared(view.camera.intrinsics, found.lattice_px)
     factor = found.spread(np.exp(-scene.exposure.log_factor(extent.view, radius2)))
     fade = found.spread(border_weight(found.lattice_px, view.camera))
-    coarseness = np.square(np.maximum(found.footprint_cells, np.float32(1.0)))
-    weight = np.asarray(fade / coarseness, dtype=np.float32)
+    weight = np.asarray(fade * sharpness_weight(found.footprint_cells), dtype=np.float32)
     offset = part[0].start - block[0].start, part[1].start - block[1].start
     stack.add(offset, found.seen, warped * factor, found.footprint_cells, weight)
 

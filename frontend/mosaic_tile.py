@@ -14,6 +14,8 @@ CHUNK_CELLS = 4096
 BORDER_SHARE = 0.08
 """A view fades in over this share of the picture's shorter side."""
 SMALLEST_WEIGHT = 0.02
+FINE_CELLS = 0.5
+"""A footprint this long, in cells, blurs a cell hardly more than a shorter one."""
 HIGHEST = 511.0
 """Levels; brighter ones (after division by a small gain) are cut, so that squares stay exact."""
 
@@ -134,3 +136,14 @@ def border_weight(px: Floats, camera: Camera) -> Floats:
     ramp = max(BORDER_SHARE * min(width_px, last - first + 1), 1.0)
     weight: Floats = np.clip(inside / ramp, SMALLEST_WEIGHT, 1.0)
     return weight
+
+
+def sharpness_weight(footprint_cells: Picture32) -> Picture32:
+    """Return weights (...) of views from the footprints of their pixels, in cells.
+
+    The fourth power of the footprint: a view twice as coarse as another hardly blurs what the
+    finer one shows, while views alike are averaged against noise. Among views that are all finer
+    than the cell the footprint matters little.
+    """
+    blur = np.square(footprint_cells) + np.float32(FINE_CELLS**2)
+    return np.asarray(np.float32(1.0) / np.square(blur), dtype=np.float32)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
+from groundfuse.frontend.area_remap import point_values
 from groundfuse.frontend.arrays import Image
 
 SMALLEST_PX = 32
@@ -23,7 +24,7 @@ class PictureCache:
         self._lock = threading.Lock()
 
     def pyramid(self, index: int) -> list[Image]:
-        """Return a picture (BGR) and its halvings, in a list of the caller's own."""
+        """Return a picture (BGR point values) and its halvings, in a list of the caller's own."""
         with self._lock:
             if index in self._held:
                 self._held.move_to_end(index)
@@ -40,10 +41,13 @@ class PictureCache:
 
 
 def _pyramid(image: Image) -> tuple[Image, ...]:
-    """A colour picture and its halvings; halving a pixel's coordinates gives its place in each."""
+    """A colour picture's point values and its halvings.
+
+    Halving a pixel's coordinates gives its place in each.
+    """
     if image.ndim == 2:
         image = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
-    levels = [image]
+    levels = [point_values(image)]
     while min(levels[-1].shape[:2]) > SMALLEST_PX:
         levels.append(np.asarray(cv2.pyrDown(levels[-1]), dtype=np.uint8))
     return tuple(levels)

@@ -1,4 +1,9 @@
-"""How sharp a mosaic is against the floor that was photographed: gradient energy on free floor."""
+"""How sharp a mosaic is against the floor that was photographed: gradient energy on free floor.
+
+The reference is the floor's true colour averaged over each cell of the mosaic, without any camera:
+what is lost to the pixels' own size counts against the mosaic. With pictures of 640 x 480 from
+0.55 m, tilted by 33 and 45 deg, a pixel covers 1.3 to 4 mm of floor; the cells here are 1.5 mm.
+"""
 
 from collections.abc import Mapping
 
