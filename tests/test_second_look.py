@@ -5,12 +5,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from painted_team import QUICK, painted_pair
 
 from groundfuse.backend.bundle_estimate import Estimated, MountEstimate
+from groundfuse.backend.drift import accuracy
 from groundfuse.backend.measurement import Attitude, Correspondences, FrameId, RelativePose, Se2
 from groundfuse.frontend.camera import Camera, Distortion, Intrinsics, Mount
+from groundfuse.tools.fuse_team import RunOptions
+from groundfuse.tools.pipeline import Stopwatch, accepted_edges, fuse_robots
 from groundfuse.tools.robot import Frame, Robot
 from groundfuse.tools.second_look import as_filed, corrected, correction, is_worth_it
+from groundfuse.tools.settings import with_settings
+from groundfuse.tools.team_folder import read_team
 
 LENS = Intrinsics(
     640, 480, 548.0, 549.5, 316.8, 243.0, Distortion.EQUIDISTANT, (0.012, -0.004, 0.001, 0.0)
@@ -107,3 +113,37 @@ def test_equal_rays_stay_equal(tmp_path):
     edges = [RelativePose(A, B, Se2(0, 0, 0), np.eye(3), 9, 0.1, p) for p in (whole, part)]
     one, other = as_filed(edges, robots(tmp_path), mounts)
     np.testing.assert_array_equal(one.correspondences.rays_a[5:16], other.correspondences.rays_a)
+
+
+def silent(items, _total, _title):
+    return items
+
+
+def test_a_wrong_mount_costs_pairs_only_at_the_first_look():
+    tilt_off = math.radians(1.2)
+    options = with_settings(RunOptions(), QUICK)
+    filed = tuple(with_tilt(robot, tilt_off) for robot in read_team(painted_pair(), ["A", "B"]))
+    once = fuse_robots(filed, replace(options, more_looks=0), 2, silent, Stopwatch())
+    again = fuse_robots(filed, options, 2, silent, Stopwatch())
+    assert again.robots == once.robots == filed
+    for robot, camera in zip(filed, again.cameras, strict=True):
+        change = camera.camera.mount.attitude.tilt_rad - robot.camera.mount.attitude.tilt_rad
+        found = next(m for m in again.bundled.mounts if m.robot == robot.name).tilt_rad
+        assert found.used
+        assert math.isclose(change, found.value)
+        # The mean wobble of a dozen views, 0.5 deg / sqrt(12), is part of what is found.
+        assert abs(change + tilt_off) < 3 * math.radians(0.15)
+    assert len(accepted_edges(again.team, again.edges)) >= len(
+        accepted_edges(once.team, once.edges)
+    )
+    truth = {f: p for robot in filed for f, p in robot.truth.items()}
+    first, last = (accuracy(some.team.team_from_base, truth).ate_m for some in (once, again))
+    assert last < 0.7 * first  # Pose2 graphs: the motions themselves are better
+
+
+def with_tilt(robot, off_rad):
+    attitude = robot.camera.mount.attitude
+    attitude = replace(attitude, tilt_rad=attitude.tilt_rad + off_rad)
+    camera = replace(robot.camera, mount=replace(robot.camera.mount, attitude=attitude))
+    frames = tuple(replace(frame, attitude=attitude) for frame in robot.frames)
+    return replace(robot, camera=camera, frames=frames)
