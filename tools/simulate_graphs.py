@@ -16,6 +16,7 @@ Flags = NDArray[np.bool_]
 Indices = NDArray[np.int64]
 
 MAX_DRAWS = 200
+WHOLE_DRAWS = 20  # of all paths at once, before each is drawn anew until it meets those before it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,13 +118,25 @@ def _meeting_paths(
     """Draw trajectories until every two robots have the right overlaps that are asked for."""
     walk = _manhattan if shape.world == "manhattan" else _free
     needed = shape.overlaps - round(shape.wrong_overlaps * shape.overlaps)
-    for _ in range(MAX_DRAWS):
+
+    def meets(path: Array, others: Sequence[Array]) -> bool:
+        return all(len(_near(other, path, reach_m)) >= needed for other in others)
+
+    for _ in range(WHOLE_DRAWS):
         paths = [walk(shape.frames, shape.step_m, area_m, rng) for _ in range(shape.robots)]
-        if all(len(_near(one, two, reach_m)) >= needed for one, two in combinations(paths, 2)):
+        if all(meets(path, paths[:r]) for r, path in enumerate(paths)):
             return paths
-    raise ValueError(
-        f"in {area_m:.3g} m two robots never had {needed} pairs of frames within {reach_m:.3g} m"
-    )
+    for r in range(shape.robots):
+        for _ in range(MAX_DRAWS):
+            if meets(paths[r], paths[:r]):
+                break
+            paths[r] = walk(shape.frames, shape.step_m, area_m, rng)
+        else:
+            raise ValueError(
+                f"in {area_m:.3g} m two robots never had {needed} pairs of frames "
+                f"within {reach_m:.3g} m"
+            )
+    return paths
 
 
 def _free(frames: int, step_m: float, area_m: float, rng: np.random.Generator) -> Array:
