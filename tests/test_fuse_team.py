@@ -444,8 +444,13 @@ def test_a_second_run_takes_what_is_known_and_ends_the_same(pair, tmp_path):
     same_but(first, pair)
     again = run(painted_pair(), out, *kept)
     assert "\nfrom the store: 7 of 7 pictures, 21 of 21 pairs\n" in again.report
+    assert "mosaic" not in again.report.splitlines()[-2]  # is there already
     assert (again.code, again.stderr) == (0, "")
     same_but(again, pair)
+    (out / "mosaic.png").write_bytes(b"spoilt")
+    mended = run(painted_pair(), out, *kept)
+    assert "mosaic" in mended.report.splitlines()[-2]
+    same_but(mended, pair)
     fresh = run(painted_pair(), out, *kept, *NUMBERS_ONLY, "--fresh")
     assert "from the store" not in fresh.report
 

@@ -12,7 +12,7 @@ from groundfuse.frontend.pairs import Pair, neighbour_pairs, retrieved_pairs, sk
 from groundfuse.tools.code_version import code_of
 from groundfuse.tools.frame_look import LookJob, look_job
 from groundfuse.tools.front_end_options import FrontEndOptions, comparable
-from groundfuse.tools.packing import key_of, packed, unpacked
+from groundfuse.tools.packing import key_of, unpacked
 from groundfuse.tools.pair_verdict import PairJob, Spot, Verdict, named, pair_job
 from groundfuse.tools.robot import Robot
 from groundfuse.tools.shelf import AllFeatures, Shelf
@@ -125,11 +125,12 @@ def _look(
 
 def _repetition(job: LookJob, shelf: Shelf, store: Store) -> float:
     """Return one number of a frame's features without fetching all of them each time."""
-    key = key_of("repetition", job.key)
-    found: float | None = store.load(key)
-    if found is None:
-        found = shelf.looked(job.key).features.repetition
-        store.save(key, "repetition", str(job.frame.id), packed(found))
+    found: float = store.kept(
+        "repetition",
+        str(job.frame.id),
+        (job.key,),
+        lambda: shelf.looked(job.key).features.repetition,
+    )
     return found
 
 
@@ -140,15 +141,16 @@ def _similar(
     options: FrontEndOptions,
     store: Store,
 ) -> list[Pair]:
-    keys = [spots[frame].key for frame in order]
-    key = key_of("retrieval", code_of("groundfuse.frontend.pairs"), keys, options.pairs.retrieval)
-    found: tuple[tuple[int, int], ...] | None = store.load(key)
-    if found is None:
-        place = {frame: k for k, frame in enumerate(order)}
-        features = AllFeatures(shelf, {frame: spots[frame].key for frame in order})
-        pairs = retrieved_pairs(features, options.pairs)
-        found = tuple((place[a], place[b]) for a, b in pairs)
-        store.save(key, "retrieval", "team", packed(found))
+    """Return the pairs that look alike; they depend on nothing but what was seen, and the order."""
+    place = {frame: k for k, frame in enumerate(order)}
+    keys = {frame: spots[frame].key for frame in order}
+
+    def work() -> list[tuple[int, int]]:
+        pairs = retrieved_pairs(AllFeatures(shelf, keys), options.pairs)
+        return [(place[a], place[b]) for a, b in pairs]
+
+    parts = (code_of("groundfuse.frontend.pairs"), list(keys.values()), options.pairs.retrieval)
+    found: tuple[tuple[int, int], ...] = store.kept("retrieval", "team", parts, work)
     return [(order[i], order[j]) for i, j in found]
 
 

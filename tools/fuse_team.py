@@ -22,15 +22,17 @@ from groundfuse.backend.bundle_estimate import BundleEstimate
 from groundfuse.frontend.mosaic import MosaicOptions
 from groundfuse.tools.calibration_file import write_calibrations
 from groundfuse.tools.closing_table import closing_table
-from groundfuse.tools.code_version import libraries
+from groundfuse.tools.code_version import code_of, libraries
 from groundfuse.tools.drift_table import drift_record
 from groundfuse.tools.errors import TeamError
 from groundfuse.tools.files import make_folder, write_atomic
+from groundfuse.tools.finished import unless_finished
 from groundfuse.tools.floor_check import check_floor
 from groundfuse.tools.front_end_options import Matcher, with_matcher
 from groundfuse.tools.open3d_check import check_with_open3d
 from groundfuse.tools.outputs import (
     check_names,
+    clear_parts,
     component_name,
     files_before,
     write_attitudes,
@@ -154,12 +156,14 @@ def run(asked: argparse.Namespace) -> Fused:
         check_names(robot.name for robot in robots)
         check_floor(robots, options.front_end.features.overhead)
         out = make_folder(asked.out)
-        write_json(out / "options.json", record(options))
     with Store(asked.store or out / STORE, fresh=asked.fresh) as store:
+        clear_parts(out)
+        write_json(out / "options.json", record(options))
         store.begin(record(options), libraries())
-        fused = _fused(asked, out, robots, options, store, watch)
+        desk = _Desk(asked, out, options, store, watch)
+        fused, old = _fused(desk, robots)
     print(f"everything is in {out}")
-    others = files_before(out, begin_s)
+    others = sorted({*files_before(out, begin_s)} - old)
     if others:
         log.warning("%s: not of this run: %s", out, ", ".join(others))
     if asked.view:
@@ -167,31 +171,44 @@ def run(asked: argparse.Namespace) -> Fused:
     return fused
 
 
-def _fused(
-    asked: argparse.Namespace,
-    out: Path,
-    robots: Sequence[Robot],
-    options: RunOptions,
-    store: Store,
-    watch: Stopwatch,
-) -> Fused:
-    """Fuse and write everything down."""
-    bar, bundled = _Bar(asked.quiet), not asked.no_bundle
-    fused = fuse_robots(robots, options, asked.workers, bar, watch, bundled=bundled, store=store)
+@dataclass(frozen=True, slots=True)
+class _Desk:
+    """What a run works with."""
+
+    asked: argparse.Namespace
+    out: Path
+    options: RunOptions
+    store: Store
+    watch: Stopwatch
+
+
+def _fused(desk: _Desk, robots: Sequence[Robot]) -> tuple[Fused, set[str]]:
+    """Fuse and write everything down; return the files that stay from an earlier run, too."""
+    asked, watch = desk.asked, desk.watch
+    fused = fuse_robots(
+        robots,
+        desk.options,
+        asked.workers,
+        _Bar(asked.quiet),
+        watch,
+        bundled=not asked.no_bundle,
+        store=desk.store,
+    )
     drift = drift_record(fused)
-    _write_numbers(out, fused, drift, watch)
+    _write_numbers(desk.out, fused, drift, watch)
     notes = [fused.front_end.reused.line()]
+    old: set[str] = set()
     try:
-        _write_pictures(asked, out, fused, options, watch)
+        old |= _write_pictures(desk, fused)
         if asked.check:
             with watch.stage("check"):
                 notes.append(_second_opinion(fused))
     finally:  # a picture that fails late doesn't cost the numbers
         table = closing_table(fused, drift, watch.seconds)
         table += "".join(f"{note}\n" for note in notes if note)
-        write_atomic(out / "report.txt", table)
+        write_atomic(desk.out / "report.txt", table)
         print(table, end="")
-    return fused
+    return fused, old
 
 
 def _write_numbers(out: Path, fused: Fused, drift: Mapping[str, Any], watch: Stopwatch) -> None:
@@ -206,20 +223,40 @@ def _write_numbers(out: Path, fused: Fused, drift: Mapping[str, Any], watch: Sto
         write_json(out / "drift.json", drift)
 
 
-def _write_pictures(
-    asked: argparse.Namespace, out: Path, fused: Fused, options: RunOptions, watch: Stopwatch
-) -> None:
+def _write_pictures(desk: _Desk, fused: Fused) -> set[str]:
+    """Write what is asked for and not there yet; return the names of what is."""
+    asked, options = desk.asked, desk.options
+    code = code_of("groundfuse.tools.fuse_team", rooms=("frontend", "backend", "tools"))
+    rests_on: tuple[object, ...] = (code, fused.key, sorted(fused.front_end.pictures.items()))
+    old: set[str] = set()
+
+    def overheads() -> None:
+        with desk.watch.stage("overhead"):
+            write_overheads(desk.out, fused, options.front_end.features.overhead)
+
     if not asked.no_mosaic:
-        quiet = asked.quiet
-        mosaics = write_mosaics(out, fused, options.mosaic, asked.workers, watch, quiet=quiet)
-        with watch.stage("drawing"):
-            write_location_graphs(out, fused, mosaics)
-            for component, mosaic in mosaics.items():
-                path = out / f"{component_name('team', component)}.ply"
-                write_ply(path, mosaic, fused.best, component)
+        old |= unless_finished(
+            desk.store,
+            desk.out,
+            "mosaic",
+            (*rests_on, options.mosaic),
+            lambda: _write_mosaics(desk, fused),
+        )
     if asked.overhead:
-        with watch.stage("overhead"):
-            write_overheads(out, fused, options.front_end.features.overhead)
+        rests_on = (*rests_on, options.front_end.features.overhead)
+        old |= unless_finished(desk.store, desk.out, "overhead", rests_on, overheads)
+    return old
+
+
+def _write_mosaics(desk: _Desk, fused: Fused) -> None:
+    out, watch, options = desk.out, desk.watch, desk.options.mosaic
+    quiet, num_workers = desk.asked.quiet, desk.asked.workers
+    mosaics = write_mosaics(out, fused, options, num_workers, watch, quiet=quiet)
+    with watch.stage("drawing"):
+        write_location_graphs(out, fused, mosaics)
+        for component, mosaic in mosaics.items():
+            path = out / f"{component_name('team', component)}.ply"
+            write_ply(path, mosaic, fused.best, component)
 
 
 def _second_opinion(fused: Fused) -> str:

@@ -58,6 +58,13 @@ def files_before(out: Path, begin_s: float) -> list[str]:
     return sorted(path.name for path in files if path.stat().st_mtime < begin_s)
 
 
+def clear_parts(out: Path) -> None:
+    """Remove what runs that were killed left half written; see `write_atomic`."""
+    for folder in (out, out / "overhead"):
+        for path in folder.glob(f".{'[0-9a-f]' * 16}.part"):
+            path.unlink(missing_ok=True)
+
+
 def csv_text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     """Return CSV text with every digit of every number."""
     stream = io.StringIO()

@@ -22,13 +22,16 @@ from groundfuse.backend.measurement import (
     FrameId,
     Rejected,
     RelativePose,
+    Se2,
     TeamEstimate,
 )
 from groundfuse.backend.team import TeamOptions, fuse
 from groundfuse.frontend.repetition import REPEATS
+from groundfuse.tools.code_version import code_of
 from groundfuse.tools.focal_gain import focal_gains
 from groundfuse.tools.front_end import FrontEndResult, run_front_end
 from groundfuse.tools.front_end_options import FrontEndOptions
+from groundfuse.tools.packing import key_of
 from groundfuse.tools.robot import Frame, Robot
 from groundfuse.tools.second_look import as_filed, corrected, is_worth_it
 from groundfuse.tools.store import Store
@@ -94,6 +97,7 @@ class Fused:
         alone: every robot by itself: chained and optimised.
         team: the Pose2 graph of the team.
         bundled: the planar bundle, its refusal, or None where it was not asked for.
+        key: digest of all that this depends on.
     """
 
     robots: tuple[Robot, ...]
@@ -103,6 +107,7 @@ class Fused:
     alone: dict[str, RobotEstimate]
     team: TeamEstimate
     bundled: BundleEstimate | BundleRefusal | None
+    key: bytes = b""
 
     @property
     def best(self) -> TeamEstimate:
@@ -188,15 +193,33 @@ def _looked(
     )
     edges = (*found.edges, *odometry_edges(robots))
     frames = [frame.id for robot in robots for frame in robot.frames]
-    with watch.stage("graphs"):
+    code = code_of("groundfuse.tools.pipeline", rooms=("frontend", "backend", "tools"))
+    rests_on: tuple[object, ...] = (code, found.key, frames, _odometry(robots), options.team)
+    known = [(r.camera, [(f.attitude, f.sigma) for f in r.frames]) for r in robots]
+
+    def graphs() -> tuple[dict[str, RobotEstimate], TeamEstimate]:
         alone = {r.name: robot_estimate(r.name, frames, edges, options.team) for r in robots}
-        team = fuse(frames, edges, options.team)
+        return alone, fuse(frames, edges, options.team)
+
+    def refine() -> BundleEstimate | BundleRefusal:
+        accepted = as_filed(accepted_edges(team, edges), robots, mounts)
+        return _bundled(robots, team, accepted, options.bundle)
+
+    with watch.stage("graphs"):
+        alone, team = store.kept("graphs", "team", rests_on, graphs)
     refined: BundleEstimate | BundleRefusal | None = None
     if bundled:
+        rests_on = (*rests_on, known, mounts, options.bundle)
         with watch.stage("bundle"):
-            accepted = as_filed(accepted_edges(team, edges), robots, mounts)
-            refined = _bundled(robots, team, accepted, options.bundle)
-    return Fused(robots, cameras, found, edges, alone, team, refined)
+            refined = store.kept("bundle", "team", rests_on, refine)
+    key = key_of("fused", rests_on, known)
+    return Fused(robots, cameras, found, edges, alone, team, refined, key)
+
+
+def _odometry(robots: Sequence[Robot]) -> list[tuple[Se2, Se2] | None]:
+    """Return all odometry as plain values."""
+    steps = (frame.odometry for robot in robots for frame in robot.frames)
+    return [None if step is None else (step.map_from_base, step.sigma) for step in steps]
 
 
 def odometry_edges(robots: Sequence[Robot]) -> tuple[RelativePose, ...]:

@@ -12,14 +12,14 @@ import logging
 import sqlite3
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 from groundfuse.tools.errors import DataError
-from groundfuse.tools.packing import is_whole, unpacked
+from groundfuse.tools.packing import is_whole, key_of, packed, unpacked
 from groundfuse.tools.store_lock import Lock
 
 log = logging.getLogger(__name__)
@@ -137,6 +137,23 @@ class Store:
             if time.monotonic() - self._synced_s > SYNC_S:
                 self._base.execute("PRAGMA wal_checkpoint(PASSIVE)")
                 self._synced_s = time.monotonic()
+
+    def kept(self, kind: str, label: str, parts: Sequence[object], work: Callable[[], Any]) -> Any:  # noqa: ANN401
+        """Return what work gives, from the entry of its key where there is one.
+
+        Args:
+            kind: what it is.
+            label: whose it is, for people.
+            parts: all that it depends on.
+            work: how it is made.
+        """
+        key = key_of(kind, *parts)
+        found = self.load(key)
+        if found is None:
+            data = packed(work())
+            self.save(key, kind, label, data)
+            found = unpacked(data)
+        return found
 
     @contextmanager
     def _told(self) -> Iterator[None]:

@@ -1,0 +1,81 @@
+"""Killed without warning at any moment, the next run goes on and ends with the same bytes."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from painted_team import QUICK, painted_pair
+
+ROOT = Path(__file__).parents[1]
+SETTINGS = [word for setting in QUICK for word in ("--set", setting)]
+TIMED = {"report.txt", "store.sqlite", "store.sqlite.lock"}
+
+
+def start(out, *more):
+    command = [sys.executable, str(ROOT / "tools" / "fuse_team.py"), "--team", str(painted_pair())]
+    command += ["--out", str(out), "--quiet", "--no-mosaic", *SETTINGS, *more]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+def finish(process):
+    text, _ = process.communicate(timeout=120)
+    assert process.returncode == 0, text
+    return text
+
+
+def content(out):
+    return {p.name: p.read_bytes() for p in out.iterdir() if p.name not in TIMED}
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    out = tmp_path_factory.mktemp("undisturbed") / "out"
+    begin = time.monotonic()
+    finish(start(out))
+    return content(out), time.monotonic() - begin
+
+
+def test_killed_again_and_again_it_ends_the_same(undisturbed, tmp_path):
+    """Each run is killed somewhat later than the one before went on."""
+    wanted, full_s = undisturbed
+    rng, out, killed = np.random.default_rng(4), tmp_path / "out", 0
+    for share in (0.5, 0.7, 0.9):
+        process = start(out)
+        try:
+            process.wait(full_s * (share + 0.1 * rng.random()))
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGKILL)
+            killed += 1
+        process.communicate()
+    assert killed >= 1
+    (out / ".0123456789abcdef.part").write_text("half")  # as a kill while a file is written leaves
+    text = finish(start(out))
+    assert "team in 1 component" in text
+    assert content(out) == wanted
+    again = finish(start(out))
+    assert "\nfrom the store: 7 of 7 pictures, 21 of 21 pairs\n" in again
+
+
+def test_a_second_run_at_the_same_time_is_told_so(undisturbed, tmp_path):  # noqa: ARG001
+    out = tmp_path / "out"
+    first = start(out)
+    try:
+        while not (out / "options.json").exists():
+            assert first.poll() is None
+            time.sleep(0.02)
+        second = start(out)
+        text, _ = second.communicate(timeout=60)
+        if first.poll() is None:  # else it was through before the second began
+            assert second.returncode == 2
+            holder = f"store is held by process {first.pid} on {os.uname().nodename}\n"
+            assert text == f"fuse_team: {out}/store.sqlite: {holder}"
+        first.communicate(timeout=60)
+        assert first.returncode == 0
+    finally:
+        first.kill()
+        first.communicate()

@@ -1,0 +1,56 @@
+"""Files that an earlier run left and that need not be made again."""
+
+import hashlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from groundfuse.tools.packing import key_of, packed
+from groundfuse.tools.store import Store
+
+
+def unless_finished(
+    store: Store, out: Path, kind: str, parts: Sequence[object], work: Callable[[], None]
+) -> set[str]:
+    """Do work that writes files, unless all it would write lies there as it left it.
+
+    Args:
+        store: remembers which files the work wrote, and their digests.
+        out: where it writes them, there and in folders one below.
+        kind: what it makes.
+        parts: all that the files depend on.
+        work: writes them.
+
+    Returns:
+        the names of the files, seen from `out`, that were there and stay.
+    """
+    key = key_of(kind, *parts)
+    known: dict[str, bytes] | None = store.load(key)
+    if known is not None and all(_digest(out / name) == known[name] for name in known):
+        return set(known)
+    before = _stamps(out)
+    work()
+    after = _stamps(out)
+    written = sorted(name for name, stamp in after.items() if before.get(name) != stamp)
+    digests = {name: _digest(out / name) for name in written}
+    store.save(key, kind, "files", packed(digests))
+    return set()
+
+
+def _digest(path: Path) -> bytes | None:
+    """Return a file's digest, a piece at a time; None where it can't be read."""
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, lambda: hashlib.blake2b(digest_size=20)).digest()
+    except OSError:
+        return None
+
+
+def _stamps(out: Path) -> dict[str, tuple[int, int, int]]:
+    """Return what tells a rewritten file from an old one: number, size and time."""
+    found = {}
+    for path in (*out.glob("*"), *out.glob("*/*")):
+        if path.is_file() and ".sqlite" not in path.name:
+            stat = path.stat()
+            name = path.relative_to(out).as_posix()
+            found[name] = (stat.st_ino, stat.st_size, stat.st_mtime_ns)
+    return found
