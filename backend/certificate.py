@@ -197,7 +197,10 @@ def _least_shift(matrix: csc_array, fine: float) -> float:
 
     def enough(shift: float) -> bool:
         raised = csc_array(matrix + sparse.diagonal(shift * headings))
-        pivots: Complex = np.asarray(sparse.factorised(raised).U.diagonal())
+        try:
+            pivots: Complex = np.asarray(sparse.factorised(raised).U.diagonal())
+        except RuntimeError:  # a pivot of exactly 0, as exact data have it
+            return False
         return bool(np.all(np.real(pivots) > 0.0))
 
     for power in range(4):
