@@ -6,7 +6,7 @@ tenth key frame), so the frames of a robot are counted 0, 1, 2, ... in order bef
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from itertools import groupby
+from itertools import groupby, pairwise
 
 from groundfuse.backend.measurement import FrameId, RelativePose, TeamEstimate
 from groundfuse.backend.team import DEFAULTS, TeamOptions, fuse
@@ -16,8 +16,11 @@ def fuse_counted(
     frames: Sequence[FrameId], edges: Sequence[RelativePose], options: TeamOptions = DEFAULTS
 ) -> TeamEstimate:
     """Fuse frames in order of their numbers, whatever the gaps (ValueError as `fuse`)."""
+    order = sorted(frames)
+    if all(b.index - a.index == 1 for a, b in pairwise(order) if a.robot == b.robot):
+        return fuse(order, edges, options)
     counted: dict[FrameId, FrameId] = {}
-    for robot, own in groupby(sorted(frames), key=lambda frame: frame.robot):
+    for robot, own in groupby(order, key=lambda frame: frame.robot):
         counted |= {frame: FrameId(robot, k) for k, frame in enumerate(own)}
     name = {new: old for old, new in counted.items()}
     dense = [replace(e, a=counted[e.a], b=counted[e.b]) for e in edges]

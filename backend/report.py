@@ -187,16 +187,34 @@ def _ambiguities(order: Sequence[FrameId], found: Findings) -> tuple[Ambiguity, 
     result = []
     for f, g in np.unique(team.maps[withheld], axis=0).tolist():
         pair = (team.maps[:, 0] == f) & (team.maps[:, 1] == g)
-        distinct: list[Answer] = []
+        found_by: list[tuple[Indices, Answer]] = []
         for assignment in answers:
             agreeing = np.flatnonzero(assignment.agreeing & pair)
             if len(agreeing):
-                pose = _place(found, team, int(agreeing[0]))
-                answer = Answer(order[first[f]], order[first[g]], planar.pose(pose), len(agreeing))
-                distinct.append(answer)
-        distinct.sort(key=lambda answer: -answer.support)
-        result.append(Ambiguity(_without_repeats(distinct)))
+                pose = planar.pose(_place(found, team, int(agreeing[0])))
+                answer = Answer(order[first[f]], order[first[g]], pose, len(agreeing))
+                found_by.append((agreeing, answer))
+        distinct = distinct_answers(found_by)
+        if len(distinct) > 1 or len(found_by) < len(answers):
+            result.append(Ambiguity(distinct))
     return tuple(result)
+
+
+def distinct_answers(found_by: Sequence[tuple[Indices, Answer]]) -> tuple[Answer, ...]:
+    """Return one answer per place, the best supported first.
+
+    Two answers mean one place if they share half of the overlaps of the one with fewer; whoever has
+    more speaks for both.
+
+    Args:
+        found_by: the overlaps that agree with an answer, and the answer.
+    """
+    kept: list[tuple[Indices, Answer]] = []
+    for overlaps, answer in sorted(found_by, key=lambda one: -one[1].support):
+        shared = (len(np.intersect1d(overlaps, known)) for known, _ in kept)
+        if all(2 * number < len(overlaps) for number in shared):
+            kept.append((overlaps, answer))
+    return tuple(answer for _, answer in kept)
 
 
 def _place(found: Findings, team: Skeleton, k: int) -> Array:
@@ -204,7 +222,3 @@ def _place(found: Findings, team: Skeleton, k: int) -> Array:
     poses, joins = found.maps.poses, team.joins
     f_from_b = planar.compose(poses[team.node[joins.a[k]]], joins.a_from_b[k])
     return planar.compose(f_from_b, planar.inverse(poses[team.node[joins.b[k]]]))
-
-
-def _without_repeats(answers: Sequence[Answer]) -> tuple[Answer, ...]:
-    return tuple(dict.fromkeys(answers))

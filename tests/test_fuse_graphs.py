@@ -263,6 +263,12 @@ def test_the_same_command_gives_the_same_files_to_the_bit(tmp_path):
         assert (one.out / name).read_bytes() == (two.out / name).read_bytes()
 
 
+def test_exact_data_are_certified(tmp_path):
+    (tmp_path / "a.g2o").write_text("EDGE_SE2 0 1 0 0 0 1 0 0 1 0 1")
+    ran = run(tmp_path / "out", tmp_path / "a.g2o")
+    assert "certified: no other solution is better (chi2 0, proven bound 0)" in ran.report
+
+
 def test_truth_of_a_single_file_and_fix_are_told(tmp_path):
     (tmp_path / "A.g2o").write_text(
         f"VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nEDGE_SE2 0 1 {STEP}\nFIX 0"

@@ -8,9 +8,10 @@ from graph_world import edge, team
 
 from groundfuse.backend import planar
 from groundfuse.backend.certificate import Status
-from groundfuse.backend.measurement import FrameId, Se2
+from groundfuse.backend.measurement import Answer, FrameId, Se2
 from groundfuse.backend.problem import chi2_per_edge
 from groundfuse.backend.renamed import fuse_counted
+from groundfuse.backend.report import distinct_answers
 from groundfuse.backend.team import fuse
 from groundfuse.backend.team_score import score
 from groundfuse.backend.team_shape import bridges, frames_by_robot
@@ -136,6 +137,23 @@ def test_names_with_gaps_come_back_in_ambiguous_answers():
         map(far, world.frames)
     )
     assert len(found.answers) == 2
+
+
+def answer(support, x_m):
+    return Answer(FrameId("A", 0), FrameId("B", 0), Se2(x_m, 0.0, 0.0), support)
+
+
+def test_answers_by_the_same_overlaps_are_one():
+    """A rival that takes a few overlaps less lies in the same place; the larger one speaks."""
+    few, many, other = answer(3, 1.0), answer(5, 1.01), answer(4, 7.0)
+    found = [
+        (np.array([1, 2, 3]), few),
+        (np.array([0, 1, 2, 3, 4]), many),
+        (np.array([4, 6, 7, 8]), other),
+    ]
+    assert distinct_answers(found) == (many, other)
+    assert distinct_answers(found[:2]) == (many,)
+    assert distinct_answers([]) == ()
 
 
 def test_scores_count_what_is_wrong_and_what_was_refused():

@@ -170,6 +170,8 @@ def _ambiguity_lines(estimate: TeamEstimate) -> list[str]:
             z = answer.a_from_b
             where = f"x {z.x_m:.3f} y {z.y_m:.3f} m {math.degrees(z.theta_rad):.2f} deg"
             lines.append(f"  {where}, by {count(answer.support, 'overlap')}")
+        if len(ambiguity.answers) == 1:
+            lines.append("  or elsewhere, by overlaps with other robots")
     return lines
 
 
