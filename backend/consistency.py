@@ -55,12 +55,17 @@ def against_chain(one: Links, forest: Forest) -> Array:
 
 def chi2_between(one: Links, two: Links, forest: Forest) -> Array:
     """Return (m,) chi2 of the cycle that each edge of `one` closes with the same row of `two`."""
-    f_from_g = one.f_from_g
-    g_from_f = planar.inverse(f_from_g)
+    g_from_f = planar.inverse(one.f_from_g)
     error = planar.log(planar.compose(g_from_f, two.f_from_g))
+    return planar.mahalanobis2(error, noise_between(one, two, forest))
+
+
+def noise_between(one: Links, two: Links, forest: Forest) -> Array:
+    """Return (m, 3, 3) covariance of those cycles, in the second map's tangent."""
+    g_from_f = planar.inverse(one.f_from_g)
     chain_f = planar.carried(planar.adjoint(g_from_f), forest.between(one.a, two.a))
-    noise = one.noise + two.noise + forest.between(one.b, two.b) + chain_f
-    return planar.mahalanobis2(error, noise)
+    noise: Array = one.noise + two.noise + forest.between(one.b, two.b) + chain_f
+    return noise
 
 
 def agreement(edges: Links, forest: Forest, limit: float) -> Flags:

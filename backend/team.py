@@ -77,6 +77,7 @@ def fuse(
         found, steps = better
     if found.verdict is not None and found.verdict.rivals:
         found = _joined(team, steps, options, guess=False)
+    found = _mended(team, steps, found)
     found = replace(found, poses=_refined(found, options))
     return estimate(team.frames, found, kind_of_step, options.robust.limit)
 
@@ -88,11 +89,7 @@ def _joined(team: Team, steps: Flags, options: TeamOptions, *, guess: bool) -> F
     for finding wrong steps only, since a wrong step looks like two answers.
     """
     whole = team.problem
-    maps = chain.spanning_forest(whole.of(steps), team.gap[steps])
-    number = np.append(np.flatnonzero(steps), -1)
-    maps = replace(maps, edge=number[maps.edge])
-    on_chain = np.zeros(len(whole), dtype=bool)
-    on_chain[maps.edge[maps.edge >= 0]] = True
+    maps, on_chain = _chains(team, steps)
     inner = maps.part[whole.a] == maps.part[whole.b]
     believed, undecided = on_chain.copy(), np.zeros(len(whole), dtype=bool)
     meetings, verdict = None, None
@@ -105,6 +102,28 @@ def _joined(team: Team, steps: Flags, options: TeamOptions, *, guess: bool) -> F
     poses, accepted = _settled(whole, start, on_chain, believed, options)
     open_edges = undecided & ~accepted
     return Findings(whole, maps, poses, accepted, on_chain, open_edges, meetings, verdict)
+
+
+def _chains(team: Team, steps: Flags) -> tuple[chain.Forest, Flags]:
+    """Return the maps chained along `steps` and which edges their chains are made of."""
+    maps = chain.spanning_forest(team.problem.of(steps), team.gap[steps])
+    number = np.append(np.flatnonzero(steps), -1)
+    maps = replace(maps, edge=number[maps.edge])
+    on_chain = np.zeros(len(steps), dtype=bool)
+    on_chain[maps.edge[maps.edge >= 0]] = True
+    return maps, on_chain
+
+
+def _mended(team: Team, steps: Flags, found: Findings) -> Findings:
+    """Put steps that were cut on trial and fit after all back into their chains.
+
+    Where several answers are open they speak of the maps as they were cut, so those stay.
+    """
+    fits = steps | (team.is_step & found.accepted)
+    if np.array_equal(fits, steps) or (found.verdict is not None and found.verdict.rivals):
+        return found
+    maps, on_chain = _chains(team, fits)
+    return replace(found, maps=maps, on_chain=on_chain)
 
 
 def _with_a_cut(

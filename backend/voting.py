@@ -15,12 +15,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from groundfuse.backend.chain import Forest
+from groundfuse.backend.chance import coincidence, expected_sets
 from groundfuse.backend.consistency import Flags, links
 from groundfuse.backend.cycles import Cycle, closed_cycles
-from groundfuse.backend.hypotheses import Hypothesis, hypotheses
+from groundfuse.backend.hypotheses import MAX_PER_PAIR, Hypothesis, hypotheses
 from groundfuse.backend.problem import Indices
 from groundfuse.backend.skeleton import Skeleton, chi2_of_joins, joined
 
+CERTAINTY = 100.0  # times rarer by chance than a rival that chance explains
 CLOSURE = 7.0  # log of 1000: how rarely a wrong hypothesis closes a cycle by chance
 
 
@@ -33,12 +35,15 @@ class VotingOptions:
         num_hypotheses: alternatives kept per pair of maps.
         ambiguity_ratio: how many times the support of the next-best answer the best one needs.
         max_alternatives: rival assignments examined.
+        chance: a rival whose support this many sets of unrelated overlaps would reach by chance is
+            no answer.
     """
 
     limit: float = 16.27  # 99.9 %
     num_hypotheses: int = 4
     ambiguity_ratio: float = 2.0
     max_alternatives: int = 100
+    chance: float = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,7 +92,12 @@ def vote(team: Skeleton, options: VotingOptions) -> Vote:
         if rival.score > best.score:
             best, rival = rival, best
         rivals.append(rival)
-    open_rivals = tuple(r for r in rivals if _is_open(r, best, options.ambiguity_ratio))
+    open_rivals = tuple(
+        r
+        for r in rivals
+        if _is_open(r, best, options.ambiguity_ratio)
+        and not _is_coincidence(team, chains, r, best, options)
+    )
     sure = np.logical_and.reduce([best.agreeing, *(r.agreeing for r in open_rivals)])
     return Vote(best, open_rivals, sure)
 
@@ -104,6 +114,32 @@ def _is_open(rival: Assignment, best: Assignment, ratio: float) -> bool:
     pairs = rival.support.keys() | best.support.keys()
     differing = sum(rival.support.get(p) != best.support.get(p) for p in pairs)
     return rival.score >= best.score - (math.log(ratio) + 1e-9) * max(1, differing)
+
+
+def _is_coincidence(
+    team: Skeleton, chains: Forest, rival: Assignment, best: Assignment, options: VotingOptions
+) -> bool:
+    """Return whether wrong overlaps make up a rival by chance, and certainly not the best answer.
+
+    The one has to hold for all pairs of maps where the two differ, the other for one of them.
+    """
+    pairs = rival.support.keys() | best.support.keys()
+    sure = False
+    for pair in pairs:
+        theirs, ours = rival.support.get(pair, 0), best.support.get(pair, 0)
+        if theirs == ours:
+            continue
+        between = (team.maps == pair).all(axis=1)
+        edges = links(team.joins.of(between), chains)
+        some = edges.of(np.arange(min(len(edges.a), MAX_PER_PAIR)))
+        probability = coincidence(some, chains, options.limit)
+        count = len(edges.a)
+        unrelated = count - ours - theirs
+        if theirs and expected_sets(unrelated, theirs, probability) < options.chance:
+            return False
+        most = options.chance / CERTAINTY
+        sure |= bool(ours) and expected_sets(count, ours, probability) < most
+    return sure
 
 
 def _alternatives(
