@@ -348,6 +348,17 @@ def test_stopping_it_is_one_line(tmp_path, monkeypatch):
     assert list(ran.out.iterdir()) == []
 
 
+def test_numbers_that_cannot_be_solved_are_one_line(tmp_path):
+    """Weights of 1e12 beside 1e-12 along the one chain that holds the frames together."""
+    rows = ["1e12 0 0 1e12 0 1e12", "1e-12 0 0 1e-12 0 1e-12"]
+    text = "".join(f"EDGE_SE2 {k} {k + 1} 1e4 0 1 {rows[k % 2]}\n" for k in range(4))
+    (tmp_path / "a.g2o").write_text(text + f"EDGE_SE2 0 4 1 0 0 {rows[0]}\n")
+    ran = run(tmp_path / "out", tmp_path / "a.g2o")
+    assert ran.code == 2
+    assert ran.stderr.startswith("fuse_graphs: the numbers are too unlike each other to be solved")
+    assert ran.stderr.count("\n") == 1
+
+
 def test_files_of_an_earlier_run_are_told(tmp_path, caplog):
     (tmp_path / "a.g2o").write_text(GOOD)
     (tmp_path / "out").mkdir()

@@ -5,12 +5,15 @@ import logging
 import os
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NoReturn
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # sparse solvers work on small dense blocks
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
 
 from groundfuse.backend.graph_keys import KeyScheme, parsed_scheme
 from groundfuse.backend.measurement import FrameId, Se2, TeamEstimate
@@ -107,12 +110,12 @@ def run(asked: argparse.Namespace) -> GraphRun:
         names = [_pair(team, a, b) for a, b in asked.relative]
         truth = _truth(asked.truth, team)
         out = make_folder(asked.out)
-    with watch.stage("fusing"):
+    with watch.stage("fusing"), _solvable():
         estimate = fused(team)
         parts = solutions(team.edges, estimate)
-    with watch.stage("certifying"):
+    with watch.stage("certifying"), _solvable():
         proofs = {p.component: p.certificate() for p in parts if len(p.frames) > 1}
-    with watch.stage("covariances"):
+    with watch.stage("covariances"), _solvable():
         relative = tuple(_relative(parts, estimate, a, b) for a, b in names)
     found = GraphRun(team, estimate, parts, proofs, relative, _score(team, estimate, truth))
     with watch.stage("writing"):
@@ -137,17 +140,19 @@ def _scheme(word: str) -> KeyScheme:
 
 
 def fused(team: TeamGraph) -> TeamEstimate:
-    """Fuse what was read.
+    """Fuse what was read."""
+    return fuse_counted(team.frames, team.edges)
 
-    Raises:
-        TeamError: the numbers are too unlike each other for the equations to be solved.
-    """
+
+@contextmanager
+def _solvable() -> Iterator[None]:
+    """Tell in one line where numbers leave nothing to compute with (singular, overflow)."""
     try:
-        return fuse_counted(team.frames, team.edges)
-    except RuntimeError as error:  # a factor that is exactly singular
-        raise TeamError(
-            f"the equations cannot be solved ({error}): covariances too unlike"
-        ) from error
+        with np.errstate(over="raise", invalid="raise"):
+            yield
+    except (RuntimeError, ArithmeticError, np.linalg.LinAlgError) as error:
+        why = " ".join(str(error).split())[:100]
+        raise TeamError(f"the numbers are too unlike each other to be solved: {why}") from error
 
 
 def _frame(team: TeamGraph, name: str) -> FrameId:
