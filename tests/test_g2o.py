@@ -30,14 +30,14 @@ def test_every_digit_survives_letters_as_ids(graph):
     assert g2o.parsed(g2o.text_of(graph, symbol_name)) == graph
 
 
-@settings(max_examples=300)
+@settings(max_examples=150)
 @given(st.text(alphabet="VERTEX_SED2 FIX#0123456789.-+einfa\n\t", max_size=200))
 def test_anything_is_read_or_refused_with_a_line(text):
     refusal = told(g2o.parsed, text)
     assert refusal is None or refusal.startswith("line ")
 
 
-@settings(max_examples=150)
+@settings(max_examples=80)
 @given(graphs(), st.data())
 def test_a_spoiled_file_is_refused_with_its_line_or_wholly_read(graph, data):
     text = data.draw(spoiled(g2o.text_of(graph), WORDS))

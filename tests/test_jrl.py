@@ -138,7 +138,7 @@ def typed(measured):
     }
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(datasets(), st.data())
 def test_a_spoiled_file_is_refused_or_wholly_read(dataset, data):
     content = json.loads(jrl.text_of(dataset))
@@ -149,7 +149,7 @@ def test_a_spoiled_file_is_refused_or_wholly_read(dataset, data):
         assert json.loads(jrl.text_of(jrl_reader.parsed(text))) == whole(content)
 
 
-@settings(max_examples=100)
+@settings(max_examples=60)
 @given(datasets(), st.data())
 def test_a_file_cut_short_is_refused(dataset, data):
     text = jrl.text_of(dataset).strip()

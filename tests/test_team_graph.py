@@ -250,6 +250,26 @@ def test_a_team_survives_jrl_with_truth_and_labels(seed):
     assert sum(map(len, made.potential_outlier_factors.values())) == sum(labels)
 
 
+def test_a_pose_that_two_robots_give_is_its_owners():
+    a0, mine, yours = key_of_symbol("a", 0), Se2(1, 0, 0), Se2(2, 0, 0)
+    for robots in ("ab", "ba"):
+        values = {"a": {a0: mine}, "b": {a0: yours}}
+        dataset = jrl.Dataset("", tuple(robots), {}, None, {r: values[r] for r in robots})
+        assert source_of_dataset("t", dataset).start == {a0: mine}
+
+
+def test_measurements_stand_at_the_later_frame_of_their_robot():
+    world = team(2, robots=2, frames=4, loops=0, overlaps=1)
+    truth = {f: planar.pose(p) for f, p in world.truth.items()}
+    made = dataset_of_team("t", truth, world.edges, letters_of("AB"))
+    for robot, entries in made.measurements.items():
+        assert [entry.stamp for entry in entries] == [0, 1, 2, 3]
+        for entry in entries:
+            for m in entry.measurements:
+                own = [k & 0xFF for k in (m.a, m.b) if chr(k >> 56) == robot]
+                assert max(own) == entry.stamp
+
+
 def test_robots_without_a_letter_get_one():
     assert letters_of(["left", "right"]) == {"left": "a", "right": "b"}
     assert letters_of("BA") == {"A": "A", "B": "B"}

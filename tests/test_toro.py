@@ -53,7 +53,7 @@ def test_gtsam_reads_what_we_write(tmp_path):
         assert np.allclose(information, matrix(edge.information), rtol=1e-12)
 
 
-@settings(max_examples=100)
+@settings(max_examples=60)
 @given(graphs(), st.data())
 def test_a_spoiled_file_is_refused_with_its_line_or_wholly_read(graph, data):
     text = data.draw(spoiled(toro.text_of(graph), WORDS))
