@@ -1,5 +1,6 @@
 """The stated overlap of two views is the floor they share."""
 
+import itertools
 import math
 
 import numpy as np
@@ -8,9 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from world_cameras import BARREL, LENS, camera, view
 
-from groundfuse.backend.measurement import Se2
+from groundfuse.backend.measurement import FrameId, Se2
 from groundfuse.frontend.camera import Distortion, Intrinsics
-from groundfuse.tools.overlap import RANGE_PER_HEIGHT, counted_floor, in_view, true_overlap
+from groundfuse.tools.overlap import (
+    RANGE_PER_HEIGHT,
+    all_overlaps,
+    counted_floor,
+    in_view,
+    true_overlap,
+)
 
 
 def test_overlap_of_nadir_views_is_that_of_rectangles():
@@ -58,3 +65,14 @@ def test_floor_behind_the_camera_or_folded_by_the_lens_is_not_seen():
     strong = Intrinsics(160, 120, 131.0, 131.0, 79.5, 59.5, Distortion.PLUMB_BOB, (-0.3, 0, 0, 0))
     seen = in_view(view(camera(45.0, lens=strong)), np.array([[-3.0, 0.0], [0.5, 0.0], [0.0, 1.2]]))
     assert seen.tolist() == [False, True, False]
+
+
+@given(st.lists(poses, max_size=6))
+@settings(max_examples=20, deadline=None)
+def test_all_overlaps_are_those_of_all_pairs(places):
+    """Views whose boxes do not meet are left out, and nothing else."""
+    views = {FrameId("A", k): view(camera(), pose) for k, pose in enumerate(places)}
+    expected = {
+        (a, b): true_overlap(views[a], views[b]) for a, b in itertools.combinations(views, 2)
+    }
+    assert all_overlaps(views) == {pair: share for pair, share in expected.items() if share > 0.0}

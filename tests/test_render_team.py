@@ -10,10 +10,11 @@ import pytest
 
 from groundfuse.backend.measurement import FrameId
 from groundfuse.frontend.camera import Distortion
+from groundfuse.tools.lawn import plan_lawn
 from groundfuse.tools.overlap import View, true_overlap
 from groundfuse.tools.photometry import Photometry
 from groundfuse.tools.render_files import picture_name
-from groundfuse.tools.render_team import main, parser, plan_scene
+from groundfuse.tools.render_team import LENSES, main, parser, plan_scene, resized
 from groundfuse.tools.team_folder import load_image, read_team
 from groundfuse.tools.world import photographs
 
@@ -111,6 +112,7 @@ def test_pictures_are_not_written_over(team, capsys):
         (["--views", "0"], "--views must be at least 1, got 0"),
         (["--seed", "-1"], "--seed must be at least 0, got -1"),
         (["--obstacles", "-1"], "--obstacles must be at least 0, got -1"),
+        (["--width", "79"], "--width must be at least 80, got 79"),
         (["--quality", "101"], "--quality must be at most 100, got 101"),
         (["--step", "0"], "--step must be positive, got 0"),
         (["--noise", "-2"], "photometry must not be negative, got -2"),
@@ -191,3 +193,28 @@ def test_the_sample_is_as_the_paper_has_it(sample_scene):
         assert shares[f"{robot}0", f"{robot}12"] > 0.5
     between = [pair for pair, share in shares.items() if pair[0][0] != pair[1][0] and share >= 0.4]
     assert 4 <= len(between) <= 16
+
+
+def test_a_smaller_sensor_sees_the_same_floor():
+    """A pixel in the middle of 2 x 2 pixels has their mean ray; distortion is in rays anyway."""
+    for lens in LENSES:
+        small = resized(lens, 320)
+        assert (small.width_px, small.height_px) == (320, 240)
+        pixels = np.array([[10.0, 20.0], [160.0, 119.0], [300.0, 200.0]])
+        rays = lens.rays_from_px(2.0 * pixels + 0.5)
+        np.testing.assert_allclose(small.rays_from_px(pixels), rays, atol=1e-9)
+        assert resized(lens, 640) == lens
+
+
+def test_a_fleet_mows_a_field_in_small_pictures(tmp_path):
+    """Small pictures of a coarser floor, in rows."""
+    words = ["--out", str(tmp_path / "fleet"), "--way", "lawn", "--width", "160", "--views", "3"]
+    assert main([*words, "--obstacles", "0"]) == 0
+    robots = read_team(tmp_path / "fleet", ["A", "B"])
+    assert [len(robot.frames) for robot in robots] == [3, 3]
+    assert load_image(robots[0].frames[0], robots[0].camera).shape == (120, 160, 3)
+    scene = scene_of([*words, "--obstacles", "0"])
+    cameras = [(robot.name, robot.camera) for robot in scene.robots]
+    assert scene.robots == plan_lawn(cameras, 3, np.random.default_rng([1, 99]))
+    plain = scene_of(["--out", "x", "--views", "3"])
+    assert scene.world.floor.cell_m == pytest.approx(4.0 * plain.world.floor.cell_m)

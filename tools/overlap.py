@@ -5,9 +5,8 @@ the foot, as if nothing stood on it. It is counted on a grid that is fixed to th
 """
 
 import functools
-import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -119,7 +118,21 @@ def true_overlap(a: View, b: View, step_per_height: float = STEP_PER_HEIGHT) -> 
     return min(1.0, float(np.count_nonzero(in_view(higher, counted))) / smaller)
 
 
+def near_pairs(a: Sequence[View], b: Sequence[View]) -> Iterator[tuple[int, int]]:
+    """Yield the indices of views of a and of b that may share floor: their boxes meet."""
+    if not a or not b:
+        return
+    low, high = (np.array(ends) for ends in zip(*(_box(view) for view in b), strict=True))
+    for i, view in enumerate(a):
+        least, most = _box(view)
+        meets = ((low <= most) & (least <= high)).all(axis=1)
+        yield from ((i, int(j)) for j in np.flatnonzero(meets))
+
+
 def all_overlaps(views: Mapping[FrameId, View]) -> dict[tuple[FrameId, FrameId], float]:
     """Return the overlap of every pair of views that has any, each pair once, in order."""
-    found = {(a, b): true_overlap(views[a], views[b]) for a, b in itertools.combinations(views, 2)}
-    return {pair: share for pair, share in found.items() if share > 0.0}
+    frames, every = list(views), list(views.values())
+    shares = (
+        (i, j, true_overlap(every[i], every[j])) for i, j in near_pairs(every, every) if i < j
+    )
+    return {(frames[i], frames[j]): share for i, j, share in shares if share > 0.0}

@@ -23,6 +23,7 @@ from groundfuse.tools.checks import finite_number
 from groundfuse.tools.errors import DataError, TeamError
 from groundfuse.tools.floors import FLOORS
 from groundfuse.tools.horizon import border_rays, check_horizon
+from groundfuse.tools.lawn import plan_lawn
 from groundfuse.tools.overlap import View
 from groundfuse.tools.photometry import Photometry
 from groundfuse.tools.render_files import write_picture, write_truth
@@ -41,6 +42,8 @@ LENSES = (
     Intrinsics(WIDTH, 480, 580.0, 579.0, 324.1, 236.4),
 )  # fmt: skip
 """Lenses dealt out to the robots in turn."""
+LEAST_WIDTH = 80
+WAYS = {"loop": plan_team, "lawn": plan_lawn}
 PLACES = ((0.15, 0.0, 0.0), (0.22, -0.07, -4.0), (-0.1, 0.1, 7.0), (0.0, 0.0, 0.0))
 """Where the camera sits on its robot in turn: x and y in camera heights, yaw in degrees."""
 SIGMA_PER_HEIGHT = 2e-3 / 0.55
@@ -51,6 +54,7 @@ examples:
   render_team.py --out team --seed 3
   render_team.py --out team --floor concrete --robots A:33 B:45 C:20 --views 26
   render_team.py --out field --floor grass --robots drone:0:70 --obstacles 0
+  render_team.py --out fleet --way lawn --width 320 --robots A:33 B:45 C:33 D:45 --views 250
 """
 
 
@@ -81,6 +85,8 @@ def parser() -> argparse.ArgumentParser:
     )
     add("--views", type=int, default=13, metavar="N", help="pictures of each robot (13)")
     add("--height", type=float, default=0.55, metavar="METRES", help="of cameras (0.55)")
+    add("--way", choices=list(WAYS), default="loop", help="loops that meet, or rows (loop)")
+    add("--width", type=int, default=WIDTH, metavar="PX", help="of the pictures (640)")
     add("--step", type=float, metavar="METRES", help="way between pictures (0.48 heights)")
     add("--obstacles", type=int, default=8, metavar="N", help="boxes and cylinders (8)")
     add("--tilt-sigma", type=float, default=0.5, metavar="DEG", help="wobble (0.5)")
@@ -109,7 +115,8 @@ def robot_camera(word: str, index: int, args: argparse.Namespace) -> tuple[str, 
         Attitude(math.radians(args.tilt_sigma), math.radians(args.roll_sigma), wobble),
         Se2(round(x * height, 6), round(y * height, 6), math.radians(yaw)),
     )
-    camera = Camera(LENSES[index % len(LENSES)], mount, name=f"camera_{name}")
+    lens = resized(LENSES[index % len(LENSES)], args.width)
+    camera = Camera(lens, mount, name=f"camera_{name}")
     border = border_rays(camera)
     farthest = replace(
         mount.attitude, tilt_rad=mount.attitude.tilt_rad + 4.0 * mount.sigma.tilt_rad
@@ -121,13 +128,33 @@ def robot_camera(word: str, index: int, args: argparse.Namespace) -> tuple[str, 
     return name, camera
 
 
+def resized(lens: Intrinsics, width_px: int) -> Intrinsics:
+    """Return a lens for a sensor with another number of pixels: the same view, coarser or finer."""
+    scale = width_px / lens.width_px
+    return replace(
+        lens,
+        width_px=width_px,
+        height_px=round(lens.height_px * scale),
+        fx_px=lens.fx_px * scale,
+        fy_px=lens.fy_px * scale,
+        cx_px=(lens.cx_px + 0.5) * scale - 0.5,
+        cy_px=(lens.cy_px + 0.5) * scale - 0.5,
+    )
+
+
 def plan_scene(args: argparse.Namespace) -> Scene:
     """Return the floor, the obstacles and every view that the command line asks for.
 
     Raises:
         ValueError: what can't be.
     """
-    for name, least in (("views", 1), ("obstacles", 0), ("quality", 1), ("seed", 0)):
+    for name, least in (
+        ("views", 1),
+        ("obstacles", 0),
+        ("quality", 1),
+        ("seed", 0),
+        ("width", LEAST_WIDTH),
+    ):
         if getattr(args, name) < least:
             raise ValueError(f"--{name} must be at least {least}, got {getattr(args, name)}")
     if args.quality > 100:
@@ -138,8 +165,10 @@ def plan_scene(args: argparse.Namespace) -> Scene:
     for name, count in Counter(name for name, _ in cameras).items():
         if count > 1:
             raise ValueError(f"robot {name!r} is named {count} times")
-    robots = plan_team(cameras, args.views, np.random.default_rng([args.seed, 99]), args.step)
-    return set_scene(args.floor, args.seed, robots, args.obstacles)
+    rng = np.random.default_rng([args.seed, 99])
+    robots = WAYS[args.way](cameras, args.views, rng, args.step)
+    grain = max(1.0, WIDTH / args.width)  # stones of the same number of pixels
+    return set_scene(args.floor, args.seed, robots, args.obstacles, grain)
 
 
 def render(args: argparse.Namespace) -> None:

@@ -12,7 +12,13 @@ import numpy as np
 from groundfuse.backend.measurement import IDENTITY, Se2
 from groundfuse.frontend.arrays import Floats
 from groundfuse.frontend.camera import Camera
-from groundfuse.tools.overlap import STEP_PER_HEIGHT, View, counted_floor, true_overlap
+from groundfuse.tools.overlap import (
+    STEP_PER_HEIGHT,
+    View,
+    counted_floor,
+    near_pairs,
+    true_overlap,
+)
 from groundfuse.tools.world import RobotSpec
 
 WAY_PER_HEIGHT = 0.48
@@ -169,9 +175,8 @@ def meetings(
     """Return the index pairs of two robots' views that share at least MIN_OVERLAP."""
     return [
         (i, j)
-        for i, view_a in enumerate(a)
-        for j, view_b in enumerate(b)
-        if true_overlap(view_a, view_b, step_per_height) >= MIN_OVERLAP
+        for i, j in near_pairs(a, b)
+        if true_overlap(a[i], b[j], step_per_height) >= MIN_OVERLAP
     ]
 
 

@@ -176,8 +176,21 @@ class Scene:
         }
 
 
-def set_scene(floor: str, seed: int, robots: Sequence[RobotSpec], num_obstacles: int = 0) -> Scene:
+def set_scene(
+    floor: str,
+    seed: int,
+    robots: Sequence[RobotSpec],
+    num_obstacles: int = 0,
+    grain: float = 1.0,
+) -> Scene:
     """Lay a floor whose grain suits the lowest camera, stand solids on it, and wobble the cameras.
+
+    Args:
+        floor: its name.
+        seed: all chance follows from it.
+        robots: who takes pictures, and where.
+        num_obstacles: solids to place.
+        grain: how many times coarser the floor is than suits 640 pixels across.
 
     Raises:
         ValueError: no robot, or an unknown floor.
@@ -185,7 +198,7 @@ def set_scene(floor: str, seed: int, robots: Sequence[RobotSpec], num_obstacles:
     if not robots:
         raise ValueError("a team needs at least one robot, got none")
     lowest = min(robot.camera.mount.attitude.height_m for robot in robots)
-    raster = make_floor(floor, seed, lowest)
+    raster = make_floor(floor, seed, lowest * grain)
     views = []
     for index, robot in enumerate(robots):
         rng = np.random.default_rng([seed, WOBBLE, index])
