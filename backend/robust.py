@@ -14,10 +14,13 @@ import numpy as np
 from groundfuse.backend import planar, sparse
 from groundfuse.backend.chain import spanning_forest
 from groundfuse.backend.consistency import Flags
-from groundfuse.backend.initial import layout_of
-from groundfuse.backend.problem import Array, Problem, chi2_per_edge, components, residuals
-from groundfuse.backend.solver import gauss_newton_step, minimise
+from groundfuse.backend.initial import chordal, layout_of
+from groundfuse.backend.problem import Array, Problem, chi2, chi2_per_edge, components, residuals
+from groundfuse.backend.solver import SolverOptions, gauss_newton_step, minimise
 
+ROUGH = SolverOptions(max_iterations=10, relative_decrease=1e-4)
+SAME = 1e-9  # relative decreases of the truncated cost below this are rounding
+COARSE = 1e-6  # part of chi2 that an inexact step of a round may miss
 RIDGE = 1e-9  # keeps the system regular while all edges of a part have lost their weight
 
 
@@ -65,7 +68,7 @@ def settle(
         options: limits.
     """
     wanted = trusted | believed
-    poses = minimise(problem.of(wanted), start, _on(layout, problem, wanted)).poses
+    poses = _begun(problem.of(wanted), start, _on(layout, problem, wanted))
     best, lowest = Robust(poses, trusted), np.inf
     for _ in range(options.max_passes):
         candidates = wanted | plausible(problem, poses, wanted, options.limit)
@@ -74,11 +77,24 @@ def settle(
         poses = _graduated(problem, poses, layout, trusted, candidates & ~trusted, options=options)
         found = _final(problem, poses, layout, trusted, options)
         cost = truncated(problem, found, options.limit)
-        if cost >= lowest:
+        if cost >= lowest * (1.0 - SAME):
             break
         best, lowest = found, cost
         poses, wanted = found
     return best
+
+
+def _begun(some: Problem, start: Array, layout: sparse.Pattern) -> Array:
+    """Return the minimum over the believed edges, from the chordal start where that is better.
+
+    Long trajectories chained end to end lie far from where their loops and overlaps put them. A few
+    steps are enough: wrong edges among the believed ones can make the way to the minimum long.
+    """
+    fill = sparse.filling(layout, 3)
+    begin = chordal(some, layout, fill)
+    if chi2(some, begin.poses) < chi2(some, start):
+        return minimise(some, begin.poses, layout, ROUGH, fill=fill, known=begin.factor).poses
+    return minimise(some, start, layout, ROUGH, fill=fill).poses
 
 
 def truncated(problem: Problem, found: Robust, limit: float) -> float:
@@ -120,11 +136,16 @@ def _graduated(
     worst = float(error[candidates].max(initial=0.0))
     control = options.limit / max(worst - options.limit, 1e-9 * options.limit)
     fill = sparse.filling(layout, 3)
+    known = None
     for _ in range(options.max_rounds):
         weights = np.where(candidates, _weights(error, control, options.limit), trusted * 1.0)
         if np.all((weights < 1e-3) | (weights > 1.0 - 1e-3)):
             break
-        step = gauss_newton_step(problem.weighted(weights), poses, layout, RIDGE, fill)
+        fine = COARSE * float(weights @ error)
+        step = gauss_newton_step(
+            problem.weighted(weights), poses, layout, RIDGE, fill, known=known, fine=fine
+        )
+        known = step.factor
         poses = planar.compose(poses, planar.exp(step.tangent))
         error = chi2_per_edge(problem, poses)
         control *= options.growth

@@ -114,7 +114,8 @@ def minimise(
     for iteration in range(1, options.max_iterations + 1):
         enough = options.relative_decrease * best_chi2 + NOTHING
         fine = FINE * enough
-        step = gauss_newton_step(problem, here, layout, damping, fill, known=known, fine=fine)
+        usable = None if damping > 0.0 else known
+        step = gauss_newton_step(problem, here, layout, damping, fill, known=usable, fine=fine)
         known = step.factor
         last = here is best and step.promised <= enough
         here = planar.compose(here, planar.exp(step.tangent))
@@ -158,7 +159,7 @@ def gauss_newton_step(
     solved = None
     if damping > 0.0:
         matrix.setdiag(matrix.diagonal() * (1.0 + damping))
-    elif known is not None:
+    if known is not None:
         solved = normal.by_known_factor(matrix, right, known, fine)
     if solved is None:
         factor = known = sparse.factorised(matrix)
