@@ -5,33 +5,17 @@ outer edges of the first column and row; the centre of cell (row, column) lies a
 x = x_min_m + (column + 1/2) m_per_px, y = y_max_m - (row + 1/2) m_per_px.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from groundfuse.frontend.area_remap import area_remap
 from groundfuse.frontend.arrays import Image, Mask
-from groundfuse.frontend.exposure_samples import merged, sample_exposure
-from groundfuse.frontend.gains import (
-    Exposure,
-    Samples,
-    estimate_exposure,
-    neutral_exposure,
-    radius_squared,
-)
-from groundfuse.frontend.mosaic_plan import (
-    Extent,
-    MosaicOptions,
-    MosaicPlan,
-    MosaicView,
-    plan_mosaic,
-)
-from groundfuse.frontend.mosaic_tile import Tile, TileStack, border_weight, sharpness_weight
-from groundfuse.frontend.picture_cache import PictureCache
+from groundfuse.frontend.mosaic_plan import MosaicOptions, MosaicPlan, MosaicView, plan_mosaic
+from groundfuse.frontend.mosaic_stream import mosaic_tiles
+from groundfuse.frontend.mosaic_tile import Tile
 from groundfuse.frontend.selection import FEWEST_VIEWS
-from groundfuse.frontend.sight import sight
+from groundfuse.frontend.sight import Grid
 
 __all__ = ["Mosaic", "MosaicOptions", "MosaicView", "build_mosaic"]
 
@@ -80,122 +64,13 @@ def build_mosaic(
             floor in sight, or a mosaic that would be too large.
     """
     options = options or MosaicOptions()
-    plan = plan_mosaic(views, options)
-    pictures = PictureCache([_checked_load(view) for view in plan.views], options.cache_bytes)
-    blocks = list(_blocks(plan, options.tile_cells))
-    samplings = len(plan.extents) if options.compensate else 0
-    told = _Steps(progress, samplings + len(blocks))
-    exposure = neutral_exposure(len(plan.views))
-    if options.compensate:
-        exposure = _exposure(plan, pictures, options.workers, told)
-    scene = _Scene(plan, pictures, exposure, options)
+    limit = min(options.max_cells, options.memory_cells)
+    plan = plan_mosaic(views, replace(options, max_cells=limit))
     layers = _blank_layers(plan)
-
-    def work(block: tuple[slice, slice]) -> None:
-        tile = _tile(scene, block)
-        if tile is not None:
-            layers.floor[block], layers.mean[block] = tile.floor, tile.mean
-            layers.count[block] = tile.count
-
-    with ThreadPoolExecutor(options.workers) as threads:
-        for _ in threads.map(work, blocks):
-            told.step()
-    return _trimmed(plan, layers)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Scene:
-    """What every tile needs."""
-
-    plan: MosaicPlan
-    pictures: PictureCache
-    exposure: Exposure
-    options: MosaicOptions
-
-
-class _Steps:
-    """Counts finished steps for whoever wants to know."""
-
-    def __init__(self, tell: Callable[[int, int], None] | None, total: int) -> None:
-        self._tell, self._total, self._done = tell, total, 0
-
-    def step(self) -> None:
-        self._done += 1
-        if self._tell is not None:
-            self._tell(self._done, self._total)
-
-
-def _checked_load(view: MosaicView) -> Callable[[], Image]:
-    """Return what loads a view's picture and refuses one of another size than its camera's."""
-
-    def load() -> Image:
-        image = view.load()
-        lens = view.camera.intrinsics
-        if image.shape[:2] != (lens.height_px, lens.width_px):
-            raise ValueError(
-                f"picture {view.frame} is {image.shape[1]} x {image.shape[0]} px, "
-                f"its camera's are {lens.width_px} x {lens.height_px}"
-            )
-        return image
-
-    return load
-
-
-def _blocks(plan: MosaicPlan, side: int) -> Iterator[tuple[slice, slice]]:
-    """Tiles row by row, every other row backwards: the next tile needs much the same pictures."""
-    for number, row in enumerate(range(0, plan.grid.rows, side)):
-        columns = range(0, plan.grid.columns, side)
-        for column in columns if number % 2 == 0 else reversed(columns):
-            yield (
-                slice(row, min(row + side, plan.grid.rows)),
-                slice(column, min(column + side, plan.grid.columns)),
-            )
-
-
-def _exposure(plan: MosaicPlan, pictures: PictureCache, workers: int, told: _Steps) -> Exposure:
-    def work(number: int) -> Samples:
-        return sample_exposure(plan, number, pictures.pyramid(plan.extents[number].view))
-
-    parts: list[Samples] = []
-    with ThreadPoolExecutor(workers) as threads:
-        for part in threads.map(work, range(len(plan.extents))):
-            parts.append(part)
-            told.step()
-    robots = sorted({view.frame.robot for view in plan.views})
-    lens_of_view = np.array([robots.index(view.frame.robot) for view in plan.views])
-    return estimate_exposure(merged(parts), lens_of_view)
-
-
-def _tile(scene: _Scene, block: tuple[slice, slice]) -> Tile | None:
-    """Combine all views of one tile, or return None where no view sees any of it."""
-    rows, columns = block[0].stop - block[0].start, block[1].stop - block[1].start
-    shown = [e for e in scene.plan.extents if e.within(*block) is not None]
-    if not shown:
-        return None
-    stack = TileStack(rows, columns, min(scene.options.max_depth, len(shown)))
-    for extent in shown:
-        _add_view(stack, scene, block, extent)
-    return stack.finished(scene.exposure.noise_levels, scene.options.num_sigmas)
-
-
-def _add_view(stack: TileStack, scene: _Scene, block: tuple[slice, slice], extent: Extent) -> None:
-    """Warp what one view shows of a tile, compensate it and put it on the stack."""
-    part = extent.within(*block)
-    if part is None:
-        return
-    plan, view = scene.plan, scene.plan.views[extent.view]
-    limit_cells = plan.limit_m[extent.view] / plan.grid.m_per_px
-    grid = plan.grid.part(*part)
-    found = sight(view.camera, view.attitude, view.team_from_foot, grid, limit_cells)
-    if not found.seen.any():
-        return
-    warped = area_remap(scene.pictures.pyramid(extent.view), found.source_px, found.seen)
-    radius2 = radius_squared(view.camera.intrinsics, found.lattice_px)
-    factor = found.spread(np.exp(-scene.exposure.log_factor(extent.view, radius2)))
-    fade = found.spread(border_weight(found.lattice_px, view.camera))
-    weight = np.asarray(fade * sharpness_weight(found.footprint_cells), dtype=np.float32)
-    offset = part[0].start - block[0].start, part[1].start - block[1].start
-    stack.add(offset, found.seen, warped * factor, found.footprint_cells, weight)
+    for block, tile in mosaic_tiles(plan, options, progress):
+        layers.floor[block], layers.mean[block] = tile.floor, tile.mean
+        layers.count[block] = tile.count
+    return trimmed(plan.grid, layers)
 
 
 def _blank_layers(plan: MosaicPlan) -> Tile:
@@ -204,14 +79,18 @@ def _blank_layers(plan: MosaicPlan) -> Tile:
     return Tile(np.zeros(colour, np.uint8), np.zeros(colour, np.uint8), np.zeros(shape, np.uint16))
 
 
-def _trimmed(plan: MosaicPlan, layers: Tile) -> Mosaic:
-    """Cut off rows and columns at the edges that nothing was seen in."""
+def trimmed(grid: Grid, layers: Tile) -> Mosaic:
+    """Cut off rows and columns at the edges that nothing was seen in.
+
+    Raises:
+        ValueError: nothing was seen at all.
+    """
     seen = layers.count > 0
     rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
     if not len(rows):
         raise ValueError("no view shows any floor within its far limit")
     block = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
-    grid, count = plan.grid.part(*block), layers.count[block]
+    grid, count = grid.part(*block), layers.count[block]
     return Mosaic(
         layers.floor[block],
         layers.mean[block],

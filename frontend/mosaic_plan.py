@@ -56,8 +56,10 @@ class MosaicOptions:
     """Estimate and remove differences of exposure, white balance and vignetting."""
     tile_cells: int = 256
     """Side of the square worked on at once, cells."""
-    max_cells: int = 60_000_000
+    max_cells: int = 2_000_000_000
     """Largest mosaic, cells; a cell that was not asked for grows to meet it."""
+    memory_cells: int = 60_000_000
+    """Larger mosaics go tile by tile to a file, and their PNG is a reduced preview, cells."""
     cache_bytes: int = 256 * 2**20
     """Pictures held in memory at once, bytes."""
     workers: int = 2

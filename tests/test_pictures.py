@@ -89,8 +89,10 @@ def test_layers_decode_to_what_they_show(made):
     mosaic = mosaics[0]
     assert list(mosaics) == [0]
     assert {p.name for p in out.iterdir()} == layer_names("mosaic")
-    assert np.array_equal(decoded(out / "mosaic.png"), mosaic.floor)
-    assert np.array_equal(decoded(out / "mosaic_mean.png"), mosaic.mean)
+    for name, layer in (("mosaic.png", mosaic.floor), ("mosaic_mean.png", mosaic.mean)):
+        picture = decoded(out / name)
+        assert np.array_equal(picture[..., :3], layer)
+        assert np.array_equal(picture[..., 3], np.where(mosaic.count > 0, 255, 0))
     assert np.array_equal(decoded(out / "mosaic_few.png") > 0, mosaic.uncertain)
     assert set(np.unique(decoded(out / "mosaic_few.png"))) <= {0, 255}
     count = decoded(out / "mosaic_count.png")
@@ -113,7 +115,7 @@ def test_the_mosaic_is_the_floor_where_the_world_file_puts_it(made):
     attitudes leave 0.06 cells (0.6 mm).
     """
     out, _, fused = made
-    picture = decoded(out / "mosaic.png").astype(float).mean(axis=2)
+    picture = decoded(out / "mosaic.png")[..., :3].astype(float).mean(axis=2)
     count = decoded(out / "mosaic_count.png") // 16
     text = (out / "mosaic.pgw").read_text()
     floor = painted_floor(1).mean(axis=2)

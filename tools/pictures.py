@@ -1,6 +1,7 @@
 """Pictures of the fused team: mosaics with world files, their layers, the location graph, 3D."""
 
-from collections.abc import Callable, Mapping
+import logging
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,13 +12,19 @@ from tqdm import tqdm
 from groundfuse.backend.measurement import FrameId, Rejected, RelativePose
 from groundfuse.frontend.arrays import Image
 from groundfuse.frontend.mosaic import Mosaic, MosaicOptions, MosaicView, build_mosaic
+from groundfuse.frontend.mosaic_plan import plan_mosaic
+from groundfuse.frontend.mosaic_preview import Preview, reduction
+from groundfuse.frontend.mosaic_stream import Told, mosaic_tiles
 from groundfuse.frontend.overhead_view import OverheadOptions, overhead_grid, overhead_view
 from groundfuse.tools.drawing import draw_location_graph
 from groundfuse.tools.errors import TeamError
 from groundfuse.tools.files import write_atomic
+from groundfuse.tools.geotiff import BLOCK, can_write, new_geotiff
 from groundfuse.tools.outputs import component_name
 from groundfuse.tools.pipeline import Fused, Stopwatch
 from groundfuse.tools.team_folder import load_image
+
+log = logging.getLogger(__name__)
 
 COUNT_GREY = 16
 """Grey values per view in the picture of the count of views."""
@@ -32,7 +39,11 @@ def write_mosaics(
     *,
     quiet: bool,
 ) -> dict[int, Mosaic]:
-    """Build and write the mosaic of every component with its layers; return them by component."""
+    """Build and write the mosaic of every component with its layers; return them by component.
+
+    A mosaic of more than `memory_cells` is written as a GeoTIFF, and what is returned and written
+    as PNG is a reduced preview; without rasterio its cells are larger from the start.
+    """
     mosaics: dict[int, Mosaic] = {}
     for component in sorted(set(fused.best.component_of.values())):
         with (
@@ -44,15 +55,43 @@ def write_mosaics(
                 bar.total = total
                 bar.update(done - bar.n)
 
-            views = _views(fused, component)
+            name, views = component_name("mosaic", component), _views(fused, component)
+            chosen = replace(options, workers=num_workers)
             try:
-                mosaic = build_mosaic(views, replace(options, workers=num_workers), told)
+                mosaic = _mosaic(out / f"{name}.tif", views, chosen, told)
             except ValueError as error:
                 raise TeamError(f"mosaic of component {component}: {error}") from error
         with watch.stage("writing"):
-            _write_layers(out, component_name("mosaic", component), mosaic)
+            _write_layers(out, name, mosaic)
         mosaics[component] = mosaic
     return mosaics
+
+
+def _mosaic(path: Path, views: Sequence[MosaicView], options: MosaicOptions, told: Told) -> Mosaic:
+    """Build a mosaic; one too large to be held goes to the GeoTIFF, and its preview comes back."""
+    path.unlink(missing_ok=True)  # one of an earlier run is not this team's
+    plan = plan_mosaic(views, options)
+    cells = plan.grid.rows * plan.grid.columns
+    if cells <= options.memory_cells:
+        return build_mosaic(views, options, told)
+    if not can_write():
+        mosaic = build_mosaic(views, options, told)
+        log.warning(
+            "%s: not written: %d x %d cells of %g m need rasterio (pip install groundfuse[geo]); "
+            "mosaic.png has larger cells, %g m",
+            path,
+            plan.grid.columns,
+            plan.grid.rows,
+            plan.grid.m_per_px,
+            mosaic.m_per_px,
+        )
+        return mosaic
+    preview = Preview(plan.grid, reduction(plan.grid, options.memory_cells, BLOCK))
+    with new_geotiff(path, plan.grid) as file:
+        for block, tile in mosaic_tiles(plan, replace(options, tile_cells=BLOCK), told):
+            file.add(block, tile)
+            preview.add(block, tile)
+        return preview.finished()
 
 
 def _views(fused: Fused, component: int) -> list[MosaicView]:
@@ -91,7 +130,9 @@ def write_overheads(out: Path, fused: Fused, options: OverheadOptions) -> None:
 def _write_layers(out: Path, stem: str, mosaic: Mosaic) -> None:
     count = np.minimum(mosaic.count.astype(np.int64) * COUNT_GREY, 255).astype(np.uint8)
     uncertain = np.where(mosaic.uncertain, 255, 0).astype(np.uint8)
-    layers = (("", mosaic.floor), ("_mean", mosaic.mean), ("_count", count), ("_few", uncertain))
+    alpha = np.where(mosaic.count > 0, 255, 0).astype(np.uint8)[..., None]  # unseen: transparent
+    floor, mean = (np.concatenate([part, alpha], axis=2) for part in (mosaic.floor, mosaic.mean))
+    layers = (("", floor), ("_mean", mean), ("_count", count), ("_few", uncertain))
     for suffix, picture in layers:
         write_png(out / f"{stem}{suffix}.png", picture)
         write_atomic(out / f"{stem}{suffix}.pgw", world_file(mosaic))
