@@ -1,11 +1,14 @@
-"""Which frames may show the same floor: every feature votes for the frames of its nearest kin.
+"""Which frames may show the same floor: a glance at all frames, then votes among the best few.
 
-No prior knowledge of where anything is. Descriptors are reduced to their leading principal
-components; each of a frame's strongest features looks up its nearest features in all other frames
-and votes for their frames, near kin more than far.
+No prior knowledge of where anything is. Each frame speaks through its largest features, which other
+cameras find again most reliably; their descriptors are reduced to leading principal components. The
+sums of what a frame's features leave over beside their nearest words (VLAD: Jegou et al.,
+Aggregating local descriptors into a compact image representation, 2010) pick candidates; then each
+feature votes for those candidates that hold near kin. So the costly part of the work per frame does
+not grow with the number of frames.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +17,11 @@ from numpy.typing import NDArray
 from groundfuse.frontend.features import Features
 
 Short = NDArray[np.float32]
-CHUNK = 2048
+Indices = NDArray[np.int64]
+CHUNK = 256
+"""Frames whose likeness to all others is held at a time."""
+ROUNDS = 10
+"""Of moving words to the middle of what is nearest to them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -22,78 +29,190 @@ class RetrievalOptions:
     """Options of retrieval.
 
     Attributes:
-        num_features: features per frame that vote and are voted for.
+        num_features: features per frame that vote and are voted for, the largest.
         num_components: principal components kept.
-        num_votes: nearest features that each feature votes for.
+        num_words: words that the glance counts.
+        num_sample: frames that components and words are learned from.
+        num_candidates: frames that each frame's features may vote for.
+        num_votes: frames that each feature votes for.
         num_frames: frames returned per frame.
     """
 
     num_features: int = 150
     num_components: int = 32
-    num_votes: int = 5
+    num_words: int = 64
+    num_sample: int = 64
+    num_candidates: int = 64
+    num_votes: int = 10
     num_frames: int = 8
 
 
-def similarity(frames: Iterable[Features], options: RetrievalOptions) -> NDArray[np.float64]:
-    """Return (n, n) votes between frames, symmetric, zero on the diagonal.
+@dataclass(frozen=True, slots=True, eq=False)
+class Vocabulary:
+    """What frames are described by, as learned from a sample of them.
 
-    Frames are read once, one after the other: they need not be in memory together.
+    Attributes:
+        mean: (d,) of descriptors.
+        axes: (d, c) leading principal components.
+        words: (k, c) unit rows.
     """
-    chosen = [_strided(frame, options.num_features) for frame in frames]
-    votes = np.zeros((len(chosen), len(chosen)))
-    owner = np.repeat(np.arange(len(chosen)), [len(rows) for rows in chosen])
-    if len(owner) == 0:
-        return votes
-    short = _reduced(chosen, options.num_components)
-    for start in range(0, len(owner), CHUNK):
-        rows = slice(start, start + CHUNK)
-        likeness = short[rows] @ short.T
-        likeness[owner[rows, None] == owner[None, :]] = -np.inf
-        _vote(votes, likeness, owner[rows], owner, options.num_votes)
-    both: NDArray[np.float64] = votes + votes.T
-    return both
+
+    mean: Short
+    axes: Short
+    words: Short
+
+    def reduced(self, rows: Short) -> Short:
+        """Project descriptors (n, d) on the components, to unit length (n, c)."""
+        return _unit((rows - self.mean) @ self.axes)
 
 
-def _strided(frame: Features, most: int) -> Short:
-    """An even selection of a frame's descriptors as unit rows; bits become -1 and 1."""
-    chosen = np.linspace(0, len(frame) - 1, min(len(frame), most)).round().astype(np.int64)
-    rows = frame.descriptors[chosen]
+@dataclass(frozen=True, slots=True, eq=False)
+class Votes:
+    """Votes between frames, each pair once, in order.
+
+    Attributes:
+        pairs: (m, 2) indices i < j.
+        weight: (m,) above 0, of both directions.
+        num_frames: of all frames.
+    """
+
+    pairs: Indices
+    weight: NDArray[np.float64]
+    num_frames: int
+
+
+def learned(sample: Iterable[Features], options: RetrievalOptions) -> Vocabulary | None:
+    """Learn components and words from some frames; None where they hold no feature."""
+    chosen = [rows for frame in sample if len(rows := _largest(frame, options.num_features))]
+    if not chosen:
+        return None
+    stacked = np.concatenate(chosen)
+    mean: Short = stacked.mean(axis=0)
+    centred = stacked - mean
+    _, axes = np.linalg.eigh(centred.T @ centred)
+    leading: Short = axes[:, ::-1][:, : options.num_components].astype(np.float32)
+    return Vocabulary(mean, leading, _words(_unit(centred @ leading), options.num_words))
+
+
+def votes(frames: Iterable[Features], known: Vocabulary, options: RetrievalOptions) -> Votes:
+    """Let every frame's features vote.
+
+    Frames are read once, one after the other: they need not be in memory together; what is kept of
+    each is some 27 kB.
+    """
+    kept = [_padded(known.reduced(_largest(f, options.num_features)), options) for f in frames]
+    if len(kept) < 2:
+        return Votes(np.zeros((0, 2), np.int64), np.zeros(0), len(kept))
+    short = np.stack(kept)
+    near = _candidates(short, known.words, options.num_candidates)
+    cast = np.concatenate([_cast(short, i, near[i], options.num_votes) for i in range(len(short))])
+    ends = np.column_stack([np.repeat(np.arange(len(near)), near.shape[1]), near.ravel()])
+    return _summed(ends[cast > 0.0], cast[cast > 0.0], len(short))
+
+
+def _summed(ends: Indices, cast: NDArray[np.float64], num_frames: int) -> Votes:
+    """Add up both directions of each pair."""
+    low, high = ends.min(axis=1), ends.max(axis=1)
+    key, place = np.unique(low * num_frames + high, return_inverse=True)
+    weight: NDArray[np.float64] = np.bincount(place, cast, len(key)).astype(np.float64)
+    return Votes(np.column_stack(np.divmod(key, num_frames)), weight, num_frames)
+
+
+def _largest(frame: Features, most: int) -> Short:
+    """Descriptors of the largest features as unit rows; bits become -1 and 1."""
+    rows = frame.descriptors[np.argsort(-frame.log_size, kind="stable")[:most]]
     if rows.dtype == np.uint8:
         rows = np.unpackbits(rows, axis=1).astype(np.float32) / 8.0 - 1.0 / 16.0
     return rows.astype(np.float32)
 
 
-def _reduced(rows: Sequence[Short], num_components: int) -> Short:
-    """Project on the leading principal components of all rows, to unit length."""
-    stacked = np.concatenate(list(rows))
-    centred = stacked - stacked.mean(axis=0)
-    _, axes = np.linalg.eigh(centred.T @ centred)
-    short = centred @ axes[:, ::-1][:, :num_components]
-    length = np.maximum(np.linalg.norm(short, axis=1, keepdims=True), 1e-9)
-    unit: Short = (short / length).astype(np.float32)
+def _unit(rows: NDArray[np.floating]) -> Short:
+    length = np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-9)
+    unit: Short = (rows / length).astype(np.float32)
     return unit
 
 
-def _vote(
-    votes: NDArray[np.float64],
-    likeness: Short,
-    voter: NDArray[np.int64],
-    owner: NDArray[np.int64],
-    num_votes: int,
-) -> None:
-    """Add the votes of some features (rows of `likeness`) to the table."""
-    count = min(num_votes, likeness.shape[1])
-    nearest = np.argpartition(-likeness, count - 1, axis=1)[:, :count]
-    value = np.take_along_axis(likeness, nearest, axis=1)
-    weight = np.where(np.isfinite(value), np.maximum(value, 0.0), 0.0) ** 4
-    np.add.at(votes, (np.repeat(voter, count), owner[nearest.ravel()]), weight.ravel())
+def _words(rows: Short, most: int) -> Short:
+    """Middles of clusters of unit rows (spherical k-means), from evenly chosen starts."""
+    start = np.linspace(0, len(rows) - 1, min(most, len(rows))).round().astype(np.int64)
+    words = rows[start]
+    for _ in range(ROUNDS):
+        nearest = np.argmax(rows @ words.T, axis=1)
+        total = np.zeros_like(words)
+        np.add.at(total, nearest, rows)
+        used = np.bincount(nearest, minlength=len(words)) > 0
+        words = np.where(used[:, None], _unit(total), words)
+    return words
 
 
-def retrieved(frames: Iterable[Features], options: RetrievalOptions) -> list[tuple[int, int]]:
-    """Return pairs (i, j), i < j, where one is among the most similar frames of the other."""
-    votes = similarity(frames, options)
-    pairs: set[tuple[int, int]] = set()
-    for i, row in enumerate(votes):
-        best = np.argsort(-row, kind="stable")[: options.num_frames]
-        pairs.update((min(i, int(j)), max(i, int(j))) for j in best if row[j] > 0.0 and j != i)
-    return sorted(pairs)
+def _padded(rows: Short, options: RetrievalOptions) -> Short:
+    """Bring a frame's rows to the common number; zeros are like nothing."""
+    full = np.zeros((options.num_features, rows.shape[1]), np.float32)
+    full[: len(rows)] = rows
+    return full
+
+
+def _glance(short: Short, words: Short) -> Short:
+    """Sum of what a frame's features (n, c) leave over beside their words, to unit length."""
+    rows = short[short.any(axis=1)]
+    nearest = np.argmax(rows @ words.T, axis=1)
+    total = np.zeros_like(words)
+    np.add.at(total, nearest, rows - words[nearest])
+    glance: Short = _unit(total.reshape(1, -1))[0]
+    return glance
+
+
+def _candidates(short: Short, words: Short, most: int) -> Indices:
+    """Return the frames (n, most) that look most like each frame, in order, without itself."""
+    count = len(short)
+    if count <= most + 1:
+        everyone = np.tile(np.arange(count), (count, 1))
+        return everyone[~np.eye(count, dtype=bool)].reshape(count, count - 1)
+    glances = np.stack([_glance(frame, words) for frame in short])
+    found = np.empty((count, most), np.int64)
+    for start in range(0, count, CHUNK):
+        likeness = glances[start : start + CHUNK] @ glances.T
+        here = np.arange(len(likeness))
+        likeness[here, start + here] = -np.inf
+        best = np.argpartition(-likeness, most - 1, axis=1)[:, :most]
+        found[start : start + CHUNK] = np.sort(best, axis=1)
+    return found
+
+
+def _cast(short: Short, voter: int, near: Indices, num_votes: int) -> NDArray[np.float64]:
+    """Return the votes (k,) of one frame for its candidates `near` (k,).
+
+    A feature finds its nearest kin in each candidate and votes for the `num_votes` nearest, by how
+    much nearer they are than the next: what looks like everything tells nothing.
+    """
+    count, size = len(near), short.shape[1]
+    others = short[near].reshape(count * size, -1)
+    likeness = (short[voter] @ others.T).reshape(size, count, size).max(axis=2)
+    value = np.maximum(likeness, 0.0) ** 2
+    if count > num_votes:
+        next_best = np.partition(value, count - 1 - num_votes, axis=1)[:, count - 1 - num_votes]
+        value = np.maximum(value - next_best[:, None], 0.0)
+    cast: NDArray[np.float64] = value.sum(axis=0, dtype=np.float64)
+    return cast
+
+
+def retrieved(
+    frames: Iterable[Features], sample: Iterable[Features], options: RetrievalOptions
+) -> list[tuple[int, int]]:
+    """Return pairs (i, j), i < j, where one is among the most similar frames of the other.
+
+    Args:
+        frames: all frames; read after the sample.
+        sample: those to learn from.
+        options: see `RetrievalOptions`.
+    """
+    known = learned(sample, options)
+    if known is None:
+        return []
+    found = votes(frames, known, options)
+    by, other = np.concatenate([found.pairs, found.pairs[:, ::-1]]).T
+    order = np.lexsort((other, -np.tile(found.weight, 2), by))
+    by, other = by[order], other[order]
+    rank = np.arange(len(by)) - np.searchsorted(by, by)
+    ends = np.column_stack([by, other])[rank < options.num_frames]
+    return sorted({(min(i, j), max(i, j)) for i, j in ends.tolist()})

@@ -8,12 +8,13 @@ from groundfuse.frontend.overhead_view import OverheadGrid
 GRID = OverheadGrid(0.002, 1.0, 0.5, 500, 500, 1.0)
 
 
-def features(descriptors):
-    """Features that have nothing but descriptors."""
+def features(descriptors, log_size=None):
+    """Features that have nothing but descriptors, and sizes where they matter."""
     count = len(descriptors)
     blank, points = np.zeros(count), np.zeros((count, 2))
+    size = blank if log_size is None else log_size
     return Features(
-        points, points, blank, blank, blank, descriptors, GRID, 0.55, 0.01, 0.01, 0.01, 0.1
+        points, points, blank, size, blank, descriptors, GRID, 0.55, 0.01, 0.01, 0.01, 0.1
     )
 
 

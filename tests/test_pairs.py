@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from road_features import along_a_road
 
 from groundfuse.backend.measurement import FrameId
+from groundfuse.frontend import pairs
 from groundfuse.frontend.pairs import PairOptions, neighbour_pairs, retrieved_pairs, skip_pairs
 from groundfuse.frontend.retrieval import RetrievalOptions
 
@@ -92,9 +93,27 @@ def test_retrieved_pairs_name_frames_whatever_their_order():
     found = along_a_road(8, 15, np.random.default_rng(0))
     names = [*robot("A", 4), *robot("B", 4)]
     options = PairOptions(retrieval=RetrievalOptions(num_frames=2))
-    pairs = retrieved_pairs(dict(zip(names, found, strict=True)), options)
-    assert {(names[k], names[k + 1]) for k in range(7)} <= set(pairs)
-    assert (FrameId("A", 3), FrameId("B", 0)) in pairs
-    assert all(a < b for a, b in pairs)
+    alike = retrieved_pairs(dict(zip(names, found, strict=True)), options)
+    assert {(names[k], names[k + 1]) for k in range(7)} <= set(alike)
+    assert (FrameId("A", 3), FrameId("B", 0)) in alike
+    assert all(a < b for a, b in alike)
     backwards = dict(reversed(list(zip(names, found, strict=True))))
-    assert retrieved_pairs(backwards, options) == pairs
+    assert retrieved_pairs(backwards, options) == alike
+
+
+def test_one_more_frame_changes_no_pair_far_away():
+    """What is learned from is drawn by name: the sample of the others stays, as do their pairs."""
+    found = along_a_road(81, 15, np.random.default_rng(1))
+    names = [*robot("A", 40), *robot("B", 41)]
+    options = PairOptions(
+        retrieval=RetrievalOptions(num_frames=2, num_candidates=12, num_sample=20)
+    )
+    whole = dict(zip(names, found, strict=True))
+    last = names[-1]
+    assert last not in sorted(names, key=pairs._lot)[:20]
+    without = {name: frame for name, frame in whole.items() if name != last}
+    before, after = retrieved_pairs(without, options), retrieved_pairs(whole, options)
+    assert {pair for pair in after if last not in pair} <= set(before)
+    assert len(set(before) - set(after)) <= 2
+    for k in range(79):
+        assert (names[k], names[k + 1]) in after
