@@ -7,7 +7,12 @@ from numpy.typing import NDArray
 
 from groundfuse.frontend.arrays import Floats, Image, Mask, Picture32
 from groundfuse.frontend.camera import Camera
-from groundfuse.frontend.selection import LEVEL, combined
+from groundfuse.frontend.selection import LEVEL
+
+try:
+    from groundfuse.frontend.selection_compiled import combined
+except ImportError:  # without numba: the same result, seven times slower at 16 views
+    from groundfuse.frontend.selection import combined
 
 CHUNK_CELLS = 4096
 """Cells combined at once: the views' colours stay in the processor's cache."""
@@ -109,8 +114,8 @@ class TileStack:
             of_depth = np.flatnonzero(self._held == depth)
             for start in range(0, len(of_depth), CHUNK_CELLS):
                 cells = of_depth[start : start + CHUNK_CELLS]
-                colours = np.take(self._colours[:depth], cells, axis=2).astype(np.float32)
-                mean[:, cells] += colours.sum(axis=0)
+                colours = np.take(self._colours[:depth], cells, axis=2)
+                mean[:, cells] += colours.sum(axis=0, dtype=np.float32)
                 footprint = np.take(self._footprint[:depth], cells, axis=1)
                 weight = np.take(self._weight[:depth], cells, axis=1)
                 noise = noise_levels * LEVEL

@@ -5,7 +5,10 @@ until half are gone. Here the rule selects; then every view that agrees with the
 counts, because on free floor half the views would be thrown away for nothing.
 """
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from groundfuse.frontend.arrays import Mask, Picture32
 
@@ -85,20 +88,24 @@ def agreeing_views(colours: Picture32, alive: Mask, noise: float, num_sigmas: fl
 
 
 def combined(
-    colours: Picture32, footprint: Picture32, weight: Picture32, noise: float, num_sigmas: float
+    colours: NDArray[Any],
+    footprint: Picture32,
+    weight: Picture32,
+    noise: float,
+    num_sigmas: float,
 ) -> Picture32:
     """Return the floor's colour (3, cells): the weighted mean of the views that agree.
 
     Fewer than three views can't outvote anything: their plain weighted mean.
 
     Args:
-        colours: (n, 3, cells) whole numbers below 2**20.
+        colours: (n, 3, cells) whole numbers, 0 to 1022 half levels.
         footprint: (n, cells) for the tie rule.
         weight: (n, cells) positive.
         noise: standard deviation of one view, same unit as the colours.
         num_sigmas: see `agreeing_views`.
     """
-    used = weight
+    used, colours = weight, colours.astype(np.float32, copy=False)
     if len(colours) >= FEWEST_VIEWS:
         alive = discard_half(colours, footprint)
         used = weight * agreeing_views(colours, alive, noise, num_sigmas)

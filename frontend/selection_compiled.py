@@ -1,0 +1,151 @@
+"""`selection.combined`, compiled: the same rule for a few cells at once, in the processor's cache.
+
+Needs numba; whoever imports this where it is missing gets an ImportError. The machine code is kept
+beside this file (or in the user's cache), so only the first run ever waits for the compiler.
+"""
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from groundfuse.frontend.arrays import Picture32
+from groundfuse.frontend.selection import FEWEST_VIEWS, SURVIVING_SPREAD
+from groundfuse.frontend.selection import combined as plainly_combined
+
+LANES = 128
+"""Cells worked on at once: the compiler turns loops over them into vector instructions."""
+
+GONE = -7_000_000
+"""Below -2 c S / n of any colours c and mean S / n: they are 1022 half levels at most."""
+DEEPEST = 128
+"""So many views at most keep all sums below 2**31; with more, numpy does it."""
+NOTHING = -(2**31)
+
+
+def combined(
+    colours: NDArray[Any],
+    footprint: Picture32,
+    weight: Picture32,
+    noise: float,
+    num_sigmas: float,
+) -> Picture32:
+    """Return what `selection.combined` does, up to rounding; colours of any whole-number type."""
+    if len(colours) > DEEPEST:
+        return plainly_combined(colours, footprint, weight, noise, num_sigmas)
+    floor: Picture32 = np.empty(colours.shape[1:], dtype=np.float32)
+    _combine(colours, footprint, weight, np.float32(noise**2), np.float32(num_sigmas**2), floor)
+    return floor
+
+
+def _combine_cells(
+    colours: Any,  # noqa: ANN401 - arrays, typed by numba when it compiles
+    footprint: Any,  # noqa: ANN401
+    weight: Any,  # noqa: ANN401
+    noise2: Any,  # noqa: ANN401
+    sigmas2: Any,  # noqa: ANN401
+    floor: Any,  # noqa: ANN401
+) -> None:
+    num_views, _, num_cells = colours.shape
+    c = np.zeros((num_views, 3, LANES), np.int32)
+    size = np.zeros((num_views, LANES), np.float32)
+    alive = np.ones((num_views, LANES), np.int32)
+    total = np.zeros((3, LANES), np.int32)
+    for start in range(0, num_cells, LANES):
+        lanes = min(LANES, num_cells - start)
+        total[:] = 0
+        alive[:] = 1
+        for k in range(num_views):
+            for channel in range(3):
+                for i in range(lanes):
+                    value = np.int32(colours[k, channel, start + i])
+                    c[k, channel, i] = value
+                    total[channel, i] += value
+            for i in range(lanes):
+                size[k, i] = footprint[k, start + i]
+        if num_views >= FEWEST_VIEWS:
+            _discard_half(c, size, alive, total)
+            _admit(c, alive, total, noise2, sigmas2)
+        _average(c, alive, weight, floor, start, lanes)
+
+
+def _discard_half(c: Any, size: Any, alive: Any, total: Any) -> None:  # noqa: ANN401
+    """The paper's rule; see `selection.discard_half`. All are whole numbers below 2**31.
+
+    With n views of sum S left, |n c - S|^2 = n (n |c|^2 - 2 c S) + |S|^2: the bracket has the same
+    order. A view that is gone gets a square so low that its bracket is below every other.
+    """
+    num_views = len(c)
+    worst = np.zeros(LANES, np.int32)
+    most = np.zeros(LANES, np.int32)
+    coarsest = np.zeros(LANES, np.float32)
+    square = np.zeros((num_views, LANES), np.int32)
+    for k in range(num_views):
+        for i in range(LANES):
+            square[k, i] = c[k, 0, i] ** 2 + c[k, 1, i] ** 2 + c[k, 2, i] ** 2
+    for gone in range(num_views // 2):
+        left = np.int32(num_views - gone)
+        most[:] = NOTHING
+        for k in range(num_views):
+            for i in range(LANES):
+                product = c[k, 0, i] * total[0, i] + c[k, 1, i] * total[1, i]
+                product += c[k, 2, i] * total[2, i]
+                away = left * square[k, i] - product - product
+                farther = (away > most[i]) | ((away == most[i]) & (size[k, i] >= coarsest[i]))
+                most[i] = away if farther else most[i]
+                coarsest[i] = size[k, i] if farther else coarsest[i]
+                worst[i] = np.int32(k) if farther else worst[i]
+        for i in range(LANES):
+            k = worst[i]
+            alive[k, i] = 0
+            square[k, i] = GONE
+            for channel in range(3):
+                total[channel, i] -= c[k, channel, i]
+
+
+def _admit(c: Any, alive: Any, total: Any, noise2: Any, sigmas2: Any) -> None:  # noqa: ANN401
+    """Mark the views that agree with the surviving half; see `selection.agreeing_views`."""
+    num_views = len(c)
+    survivors = num_views - num_views // 2
+    share = np.float32(1.0 / survivors)
+    third = np.float32(1.0 / 3.0)
+    squared = np.zeros((num_views, LANES), np.float32)
+    spread = np.zeros(LANES, np.float32)
+    for k in range(num_views):
+        for i in range(LANES):
+            a = np.float32(c[k, 0, i]) - np.float32(total[0, i]) * share
+            b = np.float32(c[k, 1, i]) - np.float32(total[1, i]) * share
+            d = np.float32(c[k, 2, i]) - np.float32(total[2, i]) * share
+            squared[k, i] = (a * a + b * b + d * d) * third
+            spread[i] += squared[k, i] * np.float32(alive[k, i]) * share
+    factor = sigmas2 * (np.float32(1.0) + share)
+    for k in range(num_views):
+        for i in range(LANES):
+            limit = factor * max(spread[i] * np.float32(SURVIVING_SPREAD), noise2)
+            alive[k, i] = 1 if squared[k, i] <= limit else alive[k, i]
+
+
+def _average(c: Any, alive: Any, weight: Any, floor: Any, start: int, lanes: int) -> None:  # noqa: ANN401
+    """Write the weighted means of the marked views."""
+    used = np.zeros((len(c), LANES), np.float32)
+    total = np.zeros(LANES, np.float32)
+    for k in range(len(c)):
+        for i in range(lanes):
+            used[k, i] = weight[k, start + i] * np.float32(alive[k, i])
+            total[i] += used[k, i]
+    for channel in range(3):
+        for i in range(lanes):
+            floor[channel, start + i] = 0.0
+        for k in range(len(c)):
+            for i in range(lanes):
+                floor[channel, start + i] += np.float32(c[k, channel, i]) * used[k, i]
+        for i in range(lanes):
+            floor[channel, start + i] /= total[i]
+
+
+_compiled: Any = njit(cache=True, nogil=True, error_model="numpy")
+_discard_half = _compiled(_discard_half)
+_admit = _compiled(_admit)
+_average = _compiled(_average)
+_combine: Any = _compiled(_combine_cells)
