@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from groundfuse.frontend import selection
+from groundfuse.frontend import mosaic_tile, selection
 
 pytest.importorskip("numba", reason="numba is not installed: numpy does the work")
 from groundfuse.frontend import selection_compiled as compiled
@@ -55,3 +55,22 @@ def test_obstacles_are_outvoted():
     colours[[0, 3, 5]] = things[:, :, None]
     ones = np.ones((7, 300), np.float32)
     assert (compiled.combined(colours, ones, ones, 3.0, 3.0) == 200.0).all()
+
+
+@pytest.mark.parametrize("depth", [1, 3, 8])
+def test_a_stack_is_numpys_to_the_bit(depth, monkeypatch):
+    """Six views on three places: with depth 3 the finest are kept, the others counted."""
+    layers = []
+    for put in (mosaic_tile.put, None):
+        monkeypatch.setattr(mosaic_tile, "put", put)
+        rng, stack = np.random.default_rng(depth), mosaic_tile.TileStack(30, 20, depth)
+        for offset in ((0, 0), (3, 2), (0, 5)) * 2:
+            seen = rng.random((25, 15)) < 0.8
+            colours = rng.uniform(0.0, 600.0, (25, 15, 3)).astype(np.float32)
+            footprint = rng.integers(1, 5, (25, 15)).astype(np.float32)
+            weight = rng.uniform(0.1, 1.0, (25, 15)).astype(np.float32)
+            stack.add(offset, seen, colours, footprint, weight)
+        layers.append(stack.finished(3.0, 3.0))
+    for name in ("floor", "mean", "count"):
+        assert np.array_equal(getattr(layers[0], name), getattr(layers[1], name))
+    assert layers[0].count.max() > 3
