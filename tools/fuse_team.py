@@ -7,9 +7,10 @@ import os
 import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 # Threads work on frames and pairs; a second layer of them inside numpy would only get in the way.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -23,6 +24,7 @@ from groundfuse.frontend.mosaic import MosaicOptions
 from groundfuse.tools.calibration_file import write_calibrations
 from groundfuse.tools.closing_table import closing_table
 from groundfuse.tools.code_version import code_of, libraries
+from groundfuse.tools.command_line import parser
 from groundfuse.tools.drift_table import drift_record
 from groundfuse.tools.errors import TeamError
 from groundfuse.tools.files import make_folder, write_atomic
@@ -58,20 +60,9 @@ from groundfuse.tools.settings import record, with_settings
 from groundfuse.tools.store import STORE, Store
 from groundfuse.tools.team_folder import list_robots, read_team
 from groundfuse.tools.view3d import view_ply, write_ply
-from groundfuse.tools.workers import Result
+from groundfuse.tools.workers import Result, Threads, Workers
 
 log = logging.getLogger(__name__)
-SAMPLE = Path(__file__).resolve().parent.parent / "data" / "team"
-EPILOG = """\
-examples:
-  fuse_team.py --robots A B                    the sample team of the project
-  fuse_team.py --team my_team --out my_map     all robots of a folder
-  fuse_team.py --robots A --matcher paper      one robot, the paper's matcher
-  fuse_team.py --robots A B --set front_end.motion.max_ambiguity=0.5
-
-a team folder holds a folder per robot: images/, camera.yaml and, if you have
-them, frames.csv (times, attitudes, odometry) and groundtruth.tum (for scoring).
-"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,51 +74,6 @@ class RunOptions(PipelineOptions):
     """
 
     mosaic: MosaicOptions = field(default_factory=MosaicOptions)
-
-
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        """Say what is wrong in one line."""
-        self.exit(2, f"fuse_team: {message}\n")
-
-
-def parser() -> argparse.ArgumentParser:
-    """Return the command line."""
-    command = _Parser(
-        prog="fuse_team.py",
-        description="Fuse the photographs of a team of ground robots into one metric floor map.",
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    add = command.add_argument
-    add("--robots", nargs="+", metavar="NAME", help="robots to fuse (default: all in the folder)")
-    add("--team", type=Path, default=SAMPLE, metavar="FOLDER", help="team folder (the sample)")
-    add("--out", type=Path, default=Path("out"), metavar="FOLDER", help="results (out)")
-    add(
-        "--matcher",
-        choices=[str(m.value) for m in Matcher],
-        default="sift",
-        help="sift: the default; fast: ORB and photometric stage; paper: the published method",
-    )
-    cores = os.cpu_count() or 1
-    add("--workers", type=int, default=cores, metavar="N", help="threads (all cores)")
-    add("--store", type=Path, metavar="FILE", help="what was computed (store.sqlite in the out)")
-    add("--fresh", action="store_true", help="start over: empty the store first")
-    add("--no-bundle", action="store_true", help="stop at the Pose2 graph")
-    add("--no-mosaic", action="store_true", help="leave out mosaic, location graph and 3D file")
-    add("--cell", type=float, metavar="METRES", help="side of a mosaic cell (from the pictures)")
-    add("--overhead", action="store_true", help="write every picture's overhead view too")
-    add("--check", action="store_true", help="second opinion: optimise the graph with Open3D too")
-    add("--view", action="store_true", help="show the map in an Open3D window at the end")
-    add(
-        "--set",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="any option, by its name in options.json",
-    )
-    add("--quiet", action="store_true", help="no progress bars")
-    return command
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -161,7 +107,8 @@ def run(asked: argparse.Namespace) -> Fused:
         write_json(out / "options.json", record(options))
         store.begin(record(options), libraries())
         desk = _Desk(asked, out, options, store, watch)
-        fused, old = _fused(desk, robots)
+        with _workers(asked) as workers:
+            fused, old = _fused(desk, robots, workers)
     print(f"everything is in {out}")
     others = sorted({*files_before(out, begin_s)} - old)
     if others:
@@ -182,7 +129,16 @@ class _Desk:
     watch: Stopwatch
 
 
-def _fused(desk: _Desk, robots: Sequence[Robot]) -> tuple[Fused, set[str]]:
+def _workers(asked: argparse.Namespace) -> AbstractContextManager[Workers]:
+    """Return who does the front-end's work: threads, or a cluster."""
+    if asked.scheduler is None:
+        return nullcontext(Threads(asked.workers))
+    from groundfuse.tools.cluster import Cluster  # noqa: PLC0415 - takes a second, seldom needed
+
+    return Cluster(asked.scheduler)
+
+
+def _fused(desk: _Desk, robots: Sequence[Robot], workers: Workers) -> tuple[Fused, set[str]]:
     """Fuse and write everything down; return the files that stay from an earlier run, too."""
     asked, watch = desk.asked, desk.watch
     fused = fuse_robots(
@@ -193,6 +149,7 @@ def _fused(desk: _Desk, robots: Sequence[Robot]) -> tuple[Fused, set[str]]:
         watch,
         bundled=not asked.no_bundle,
         store=desk.store,
+        workers=workers,
     )
     drift = drift_record(fused)
     _write_numbers(desk.out, fused, drift, watch)
