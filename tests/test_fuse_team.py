@@ -28,7 +28,8 @@ from groundfuse.backend.measurement import FrameId, Se2
 from groundfuse.backend.trajectory import parsed_tum
 from groundfuse.frontend.overhead import floor_from_rays
 from groundfuse.tools import fuse_team
-from groundfuse.tools.fuse_team import SAMPLE, RunOptions
+from groundfuse.tools.command_line import EPILOG, SAMPLE
+from groundfuse.tools.fuse_team import RunOptions
 from groundfuse.tools.settings import record
 from groundfuse.tools.store import Store
 from groundfuse.tools.team_folder import read_team
@@ -771,7 +772,7 @@ def test_help_fits_a_terminal_and_names_every_option(monkeypatch):
 
 
 def test_the_examples_of_the_help_are_valid():
-    lines = [s.strip() for s in fuse_team.EPILOG.splitlines() if "fuse_team.py --" in s]
+    lines = [s.strip() for s in EPILOG.splitlines() if "fuse_team.py --" in s]
     assert len(lines) >= 4
     for line in lines:
         words = shlex.split(line.split("  ")[0])
