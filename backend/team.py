@@ -77,7 +77,6 @@ def fuse(
         found, steps = better
     if found.verdict is not None and found.verdict.rivals:
         found = _joined(team, steps, options, guess=False)
-    found = _mended(team, steps, found)
     found = replace(found, poses=_refined(found, options))
     return estimate(team.frames, found, kind_of_step, options.robust.limit)
 
@@ -114,18 +113,6 @@ def _chains(team: Team, steps: Flags) -> tuple[chain.Forest, Flags]:
     return maps, on_chain
 
 
-def _mended(team: Team, steps: Flags, found: Findings) -> Findings:
-    """Put steps that were cut on trial and fit after all back into their chains.
-
-    Where several answers are open they speak of the maps as they were cut, so those stay.
-    """
-    fits = steps | (team.is_step & found.accepted)
-    if np.array_equal(fits, steps) or (found.verdict is not None and found.verdict.rivals):
-        return found
-    maps, on_chain = _chains(team, fits)
-    return replace(found, maps=maps, on_chain=on_chain)
-
-
 def _with_a_cut(
     team: Team, steps: Flags, found: Findings, options: TeamOptions
 ) -> tuple[Findings, Flags] | None:
@@ -140,7 +127,7 @@ def _with_a_cut(
         fewer[cut.edge] = False
         again = _joined(team, fewer, options, guess=True)
         cost = _truncated(again, team.is_step, options)
-        if cost < lowest:
+        if cost < lowest and not again.accepted[cut.edge]:  # a step that fits was not the reason
             best, lowest = (again, fewer), cost
     return best
 

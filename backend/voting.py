@@ -134,7 +134,7 @@ def _is_coincidence(
         some = edges.of(np.arange(min(len(edges.a), MAX_PER_PAIR)))
         probability = coincidence(some, chains, options.limit)
         count = len(edges.a)
-        unrelated = count - ours - theirs
+        unrelated = max(0, count - ours - theirs)  # some may agree with both
         if theirs and expected_sets(unrelated, theirs, probability) < options.chance:
             return False
         most = options.chance / CERTAINTY

@@ -84,7 +84,7 @@ def test_the_same_numbers_without_others_stay_open(seed):
     assert false_accepts(world, estimate) == 0
 
 
-def test_a_step_that_was_cut_on_trial_and_fits_is_back_in_its_chain():
+def test_a_step_that_fits_after_all_is_not_cut():
     world = team(2, overlaps=40, wrong_overlaps=0.8)
     estimate = fuse(world.frames, world.edges)
     assert [a.robot for a in estimate.anchors] == ["A", "B"]
@@ -102,3 +102,18 @@ def test_two_against_one_stays_open():
     estimate = fuse([*a, *b], edges)
     (ambiguity,) = estimate.ambiguities
     assert [answer.support for answer in ambiguity.answers] == [2, 1]
+
+
+def test_answers_that_share_overlaps_leave_none_unrelated():
+    """The first team where two answers together had more overlaps than there are."""
+    world = team(1, robots=3, frames=50, overlaps=15, wrong_overlaps=0.8, consistent=True)
+    estimate = fuse(world.frames, world.edges)
+    assert false_accepts(world, estimate) == 0
+
+
+def test_cutting_a_step_that_fits_does_not_let_the_majority_win():
+    """Wrong overlaps outnumber right ones four to one in every pair; closures decide."""
+    world = team(10, robots=3, frames=50, overlaps=15, wrong_overlaps=0.8, consistent=True)
+    estimate = fuse(world.frames, world.edges)
+    assert false_accepts(world, estimate) == 0
+    assert set(estimate.component_of.values()) == {0}
