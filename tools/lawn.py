@@ -54,6 +54,13 @@ def turn_way_m(row_m: float, swing_m: float) -> float:
     return math.pi * math.hypot(row_m / 2.0, swing_m)
 
 
+def side_m(num_views: int, row_m: float, step_m: float, swing_m: float) -> float:
+    """Return the side of the square that the rows of so many views fill; see `mown`."""
+    turn_m = turn_way_m(row_m, swing_m)
+    # Rows and their arcs: side (side + turn) / row = all of the way.
+    return (math.sqrt(turn_m**2 + 4.0 * num_views * step_m * row_m) - turn_m) / 2.0
+
+
 def plan_lawn(
     cameras: Sequence[tuple[str, Camera]],
     num_views: int,
@@ -75,19 +82,17 @@ def plan_lawn(
     lowest = min((mount.height_m for mount in mounts), default=1.0)
     swing_m = max((m.height_m * math.tan(m.tilt_rad) for m in mounts), default=0.0)
     row_m, step = ROW_PER_HEIGHT * lowest, step_m or WAY_PER_HEIGHT * lowest
-    turn_m = turn_way_m(row_m, swing_m)
-    # Rows and their arcs fill a square: side (side + turn) / row = all of the way.
-    side_m = (math.sqrt(turn_m**2 + 4.0 * num_views * step * row_m) - turn_m) / 2.0
-    pitch_m = max(side_m - SHARED_ROWS * row_m, row_m)
+    length_m = side_m(num_views, row_m, step, swing_m)
+    pitch_m = max(length_m - SHARED_ROWS * row_m, row_m)
     columns = math.ceil(math.sqrt(len(cameras)))
     team = []
     for k, (name, camera) in enumerate(cameras):
         block_row, block_column = divmod(k, columns)
-        poses = mown(num_views, side_m, row_m, step, swing_m)
+        poses = mown(num_views, length_m, row_m, step, swing_m)
         poses[:, 2] += HEADING_SIGMA_RAD * rng.standard_normal(num_views)
         corner = Se2(block_column * pitch_m, block_row * pitch_m, 0.0)
         if (block_row + block_column) % 2:  # across: about the block's middle, to the other side
-            corner = corner @ Se2(side_m, 0.0, math.pi / 2.0)
+            corner = corner @ Se2(length_m, 0.0, math.pi / 2.0)
         team.append(
             RobotSpec(name, camera, tuple(corner @ Se2(*map(float, pose)) for pose in poses))
         )
