@@ -13,6 +13,8 @@ JACOBIAN_STEP = 4
 """The scale of the picture is looked at in every fourth cell of every fourth row."""
 OUTSIDE_PX = -1e4
 """Stands for a cell without a place in the picture, which remap cannot take as nan."""
+PADDING_PX = 16
+"""A cell inside the picture reaches out by half its own 16 px at most, and bicubic by two more."""
 MEAN_TO_POINT = np.array([-1.0, 26.0, -1.0], dtype=np.float32) / np.float32(24.0)
 """A pixel is the mean m of the light over its square; the light at its middle is m - m'' / 24 to
 fourth order, along each axis (the finite-volume methods' rule)."""
@@ -59,7 +61,14 @@ def area_plan(source_px: Floats, wanted: Mask) -> AreaPlan:
 
 def area_remap(pyramid: list[Image], source_px: Floats, wanted: Mask) -> Image:
     """Plan and read at once, bicubic throughout; see `area_plan` and `area_read`."""
-    return area_read(pyramid, area_plan(source_px, wanted), cv2.INTER_CUBIC)
+    plan = area_plan(source_px, wanted)
+    # Cells far outside cost as much as others unless the border is constant; what cells at the
+    # edge read beyond it is in the padding.
+    picture = _level(pyramid, plan)
+    padded = cv2.copyMakeBorder(picture, *(PADDING_PX,) * 4, cv2.BORDER_REPLICATE)
+    map_u, map_v = plan.map_u + np.float32(PADDING_PX), plan.map_v + np.float32(PADDING_PX)
+    sampled = cv2.remap(padded, map_u, map_v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
+    return _cell_means(np.asarray(sampled), plan)
 
 
 def point_values(image: Image) -> Image:
@@ -75,7 +84,7 @@ def point_values(image: Image) -> Image:
     return np.asarray(points, dtype=image.dtype)
 
 
-def area_read(pyramid: list[Image], plan: AreaPlan, supersampling: int = cv2.INTER_LINEAR) -> Image:
+def area_read(pyramid: list[Image], plan: AreaPlan) -> Image:
     """Average the picture over each cell: the pyramid level that loses nothing, supersampled.
 
     Where the picture is coarser than the cells it is interpolated (bicubic).
@@ -83,20 +92,26 @@ def area_read(pyramid: list[Image], plan: AreaPlan, supersampling: int = cv2.INT
     Args:
         pyramid: the picture, then halvings of it; grows where more are needed.
         plan: where each cell reads.
-        supersampling: how places between pixels are read where a cell takes several: linear loses
-            detail near a pixel's size, bicubic costs twice the time.
     """
-    while len(pyramid) <= plan.level:
-        pyramid.append(np.asarray(cv2.pyrDown(pyramid[-1]), dtype=pyramid[0].dtype))
-    interpolation = cv2.INTER_CUBIC if plan.samples == 1 else supersampling
-    picture = pyramid[plan.level]
+    interpolation = cv2.INTER_CUBIC if plan.samples == 1 else cv2.INTER_LINEAR
+    picture = _level(pyramid, plan)
     sampled = cv2.remap(
         picture, plan.map_u, plan.map_v, interpolation, borderMode=cv2.BORDER_REPLICATE
     )
+    return _cell_means(np.asarray(sampled), plan)
+
+
+def _level(pyramid: list[Image], plan: AreaPlan) -> Image:
+    while len(pyramid) <= plan.level:
+        pyramid.append(np.asarray(cv2.pyrDown(pyramid[-1]), dtype=pyramid[0].dtype))
+    return pyramid[plan.level]
+
+
+def _cell_means(sampled: Image, plan: AreaPlan) -> Image:
     rows, columns = plan.map_u.shape
     size = (columns // plan.samples, rows // plan.samples)
     averaged = cv2.resize(sampled, size, interpolation=cv2.INTER_AREA)
-    return np.asarray(averaged, dtype=pyramid[0].dtype)
+    return np.asarray(averaged, dtype=sampled.dtype)
 
 
 def _level_and_factor(source_px: Floats, wanted: Mask) -> tuple[int, int]:

@@ -18,6 +18,8 @@ try:
 except ImportError:
     put = None
 
+__all__ = ["Tile", "TileStack", "border_weight", "combined", "sharpness_weight"]
+
 CHUNK_CELLS = 4096
 """Cells combined at once: the views' colours stay in the processor's cache."""
 BORDER_SHARE = 0.08
