@@ -82,7 +82,7 @@ def bench_retrieval(views: int, floor: str, seed: int) -> None:
 
 
 def bench_speed(floor: str, seed: int) -> None:
-    """Print medians of one core on pictures of 640 x 480."""
+    """Print medians of one core's busy time on pictures of 640 x 480."""
     print(f"{'match':<7}{'frames':>8}{'ms/frame':>10}{'pairs':>8}{'ms/pair':>10}  (no photometric)")
     for matcher in (Matcher.SIFT, Matcher.FAST):
         frames, pairs = speeds(floor, seed, matcher)
