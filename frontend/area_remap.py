@@ -65,10 +65,11 @@ def area_remap(pyramid: list[Image], source_px: Floats, wanted: Mask) -> Image:
     # Cells far outside cost as much as others unless the border is constant; what cells at the
     # edge read beyond it is in the padding.
     picture = _level(pyramid, plan)
-    padded = cv2.copyMakeBorder(picture, *(PADDING_PX,) * 4, cv2.BORDER_REPLICATE)
+    pad = PADDING_PX
+    padded = cv2.copyMakeBorder(picture, pad, pad, pad, pad, cv2.BORDER_REPLICATE)
     map_u, map_v = plan.map_u + np.float32(PADDING_PX), plan.map_v + np.float32(PADDING_PX)
     sampled = cv2.remap(padded, map_u, map_v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
-    return _cell_means(np.asarray(sampled), plan)
+    return _cell_means(np.asarray(sampled, dtype=picture.dtype), plan)
 
 
 def point_values(image: Image) -> Image:
@@ -98,7 +99,7 @@ def area_read(pyramid: list[Image], plan: AreaPlan) -> Image:
     sampled = cv2.remap(
         picture, plan.map_u, plan.map_v, interpolation, borderMode=cv2.BORDER_REPLICATE
     )
-    return _cell_means(np.asarray(sampled), plan)
+    return _cell_means(np.asarray(sampled, dtype=picture.dtype), plan)
 
 
 def _level(pyramid: list[Image], plan: AreaPlan) -> Image:

@@ -107,6 +107,6 @@ def _add_overviews(path: Path, grid: Grid) -> None:
         factors.append(factor)
         factor *= 2
     if factors:
-        options = {"COMPRESS_OVERVIEW": "DEFLATE", "SPARSE_OK_OVERVIEW": "ON"}
+        options: dict[str, Any] = {"COMPRESS_OVERVIEW": "DEFLATE", "SPARSE_OK_OVERVIEW": "ON"}
         with rasterio.Env(**options), rasterio.open(path, "r+") as file:
             file.build_overviews(factors, Resampling.average)
