@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from groundfuse.tools.bench_scale import exponent, growth_table, main
-from groundfuse.tools.bench_scale_fleets import twice_mown
+from groundfuse.tools.bench_scale_fleets import fleet, fleet_path, twice_mown
 from groundfuse.tools.bench_scale_runs import Growth, _hits, recalls, reruns
 
 
@@ -50,6 +50,13 @@ def test_two_robots_mow_the_same_field_and_find_each_other():
     found = recalls(team, "sift")
     assert found.num_asked >= 8
     assert found.at_5 >= 0.9
+
+
+def test_a_fleet_that_was_half_rendered_is_rendered_anew(tmp_path):
+    half = fleet_path(tmp_path, 4, 3).with_name("fleet_4_3.half")
+    (half / "A" / "images").mkdir(parents=True)
+    assert [len(robot.frames) for robot in fleet(tmp_path, 4, 3)] == [1, 1, 1, 1]
+    assert [path.name for path in tmp_path.iterdir()] == ["fleet_4_3"]
 
 
 def test_the_bench_runs_on_a_fleet_and_names_what_cannot_be(tmp_path, capsys):

@@ -1,6 +1,7 @@
 """Teams of any size for `bench_scale.py`: rendered into folders, or in memory."""
 
 import math
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,9 +40,12 @@ def fleet(folder: Path, num_frames: int, seed: int) -> tuple[Robot, ...]:
         raise DataError(f"a fleet needs a multiple of {len(NAMES)} frames, got {num_frames}")
     path = fleet_path(folder, num_frames, seed)
     if not path.exists():
-        words = ["--out", str(path), "--way", "lawn", "--width", str(WIDTH), "--seed", str(seed)]
+        half = path.with_name(f"{path.name}.half")  # a bench that was stopped leaves no half fleet
+        shutil.rmtree(half, ignore_errors=True)
+        words = ["--out", str(half), "--way", "lawn", "--width", str(WIDTH), "--seed", str(seed)]
         if render_team.main([*words, "--robots", *ROBOTS, "--views", str(views)]) != 0:
             raise DataError(f"{path}: could not be rendered")
+        half.rename(path)
     return read_team(path, NAMES)
 
 
