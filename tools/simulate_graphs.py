@@ -122,6 +122,7 @@ def _meeting_paths(
     def meets(path: Array, others: Sequence[Array]) -> bool:
         return all(len(_near(other, path, reach_m)) >= needed for other in others)
 
+    paths: list[Array] = []
     for _ in range(WHOLE_DRAWS):
         paths = [walk(shape.frames, shape.step_m, area_m, rng) for _ in range(shape.robots)]
         if all(meets(path, paths[:r]) for r, path in enumerate(paths)):
