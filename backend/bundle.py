@@ -23,6 +23,10 @@ from groundfuse.backend.bundle_estimate import (
 )
 from groundfuse.backend.bundle_files import (
     FileTest,
+    as_filed,
+    contradicted,
+    files_test,
+    freed_priors,
     settled_files,
     with_better_files,
 )
@@ -163,17 +167,30 @@ def _solved(
     if isinstance(trial, BundleRefusal):
         return trial
     relief, better = settle_relief(*trial, options, START.settled)
+    state = better.state
     if relief > 0.0:
-        priors = replace(priors, relief=relief)
-        clean = _cleaned(job, priors, better, better.state)
+        priors, state = _judged_anew(trial[0], better, relief, options)
+        clean = _cleaned(job, priors, better, state)
         joined = _joined(job, clean)
     most = max(options.most_sightings // num_frames, LEAST_SIGHTINGS)
     points = sampled(*joined, job.sightings, most)
-    last = _stage(job, clean, priors, better.state, points, replace(LAST, noise=better.noise))
+    last = _stage(job, clean, priors, state, points, replace(LAST, noise=better.noise))
     if isinstance(last, BundleRefusal):
         return last
     problem, solution, test = with_better_files(*last, options, LAST.settled)
     return problem, solution, clean, test
+
+
+def _judged_anew(
+    problem: Problem, solution: Solution, relief: float, options: BundleOptions
+) -> tuple[Priors, State]:
+    """Free only what still contradicts a file where the floor has relief.
+
+    Taken for flat, such a floor looks as a wrong lens does.
+    """
+    rough = replace(problem, priors=replace(problem.priors, relief=relief))
+    free = contradicted(files_test(rough, solution, options), rough.priors, options)
+    return freed_priors(rough.priors, free), as_filed(solution.state, free)
 
 
 def _joined(job: Job, clean: Cut) -> Points:
