@@ -340,6 +340,15 @@ class TestRelief:
         (text,) = texts(found, FindingKind.RELIEF)
         assert text.startswith("the floor is not flat: its points' heights spread by 0.00")
 
+    def test_waves_do_not_discredit_right_files(self):
+        # Taken for flat, seeds 15 and 16 contradict a focal length and a mount.
+        for seed in (15, 16):
+            found = solved(world(seed, relief=self.waves(0.003, 0.3), noise_px=0.3))
+            assert found.relief > 0.0
+            for mount in found.mounts:
+                assert not mount.focal.used
+                assert not (mount.tilt_rad.used or mount.roll_rad.used or mount.height.used)
+
     def test_a_flat_floor_is_taken_as_flat(self):
         assert [solved(world(80 + seed)).relief for seed in range(5)] == [0.0] * 5
 
