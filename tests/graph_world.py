@@ -1,6 +1,5 @@
 """Small graphs with known truth for the back-end's tests."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,7 @@ from groundfuse.backend.measurement import Array, FrameId, RelativePose, Se2, Te
 from groundfuse.backend.problem import Problem
 from groundfuse.tools.simulate_graphs import TeamGraphs, TeamShape, simulate
 
-GRAPHS = Path(os.environ.get("GROUNDFUSE_REAL", "/work/shared/real")) / "graphs"
+GRAPHS = Path(__file__).resolve().parents[2] / "shared" / "real" / "graphs"
 """Public graphs, kept out of the repository because of their licences."""
 
 
