@@ -346,8 +346,8 @@ class TestRelief:
             found = solved(world(seed, relief=self.waves(0.003, 0.3), noise_px=0.3))
             assert found.relief > 0.0
             for mount in found.mounts:
-                assert not mount.focal.used
-                assert not (mount.tilt_rad.used or mount.roll_rad.used or mount.height.used)
+                for number in (mount.tilt_rad, mount.roll_rad, mount.height, mount.focal):
+                    assert not number.used
 
     def test_a_flat_floor_is_taken_as_flat(self):
         assert [solved(world(80 + seed)).relief for seed in range(5)] == [0.0] * 5
