@@ -23,10 +23,7 @@ from groundfuse.backend.bundle_estimate import (
 )
 from groundfuse.backend.bundle_files import (
     FileTest,
-    as_filed,
-    contradicted,
-    files_test,
-    freed_priors,
+    judged_files,
     settled_files,
     with_better_files,
 )
@@ -189,8 +186,7 @@ def _judged_anew(
     Taken for flat, such a floor looks as a wrong lens does.
     """
     rough = replace(problem, priors=replace(problem.priors, relief=relief))
-    free = contradicted(files_test(rough, solution, options), rough.priors, options)
-    return freed_priors(rough.priors, free), as_filed(solution.state, free)
+    return judged_files(rough, solution, options)
 
 
 def _joined(job: Job, clean: Cut) -> Points:

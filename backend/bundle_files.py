@@ -121,12 +121,19 @@ def settled_files(
     The problem has all mounts free and no lens. Numbers that are contradicted and were not free
     are solved for, because the residuals of a wrong lens look like wrong correspondences.
     """
-    priors = problem.priors
-    free = contradicted(files_test(problem, solution, options), priors, options)
-    fewer = freed_priors(priors, free)
-    if free[:, LENS].any():
-        solution = _solved(replace(problem, priors=fewer), solution, options, settled)
-    return fewer, solution, as_filed(solution.state, free)
+    priors, state = judged_files(problem, solution, options)
+    if priors.free_lens.any():
+        solution = _solved(replace(problem, priors=priors), solution, options, settled)
+        state = as_filed(solution.state, np.hstack([priors.free_mount, priors.free_lens]))
+    return priors, solution, state
+
+
+def judged_files(
+    problem: Problem, solution: Solution, options: BundleOptions
+) -> tuple[Priors, State]:
+    """Return priors that free only what the pictures contradict, and the state as filed else."""
+    free = contradicted(files_test(problem, solution, options), problem.priors, options)
+    return freed_priors(problem.priors, free), as_filed(solution.state, free)
 
 
 def _solved(

@@ -11,10 +11,11 @@ from groundfuse.backend.bundle_estimate import Estimated, MountEstimate
 from groundfuse.backend.drift import accuracy
 from groundfuse.backend.measurement import Attitude, Correspondences, FrameId, RelativePose, Se2
 from groundfuse.frontend.camera import Camera, Distortion, Intrinsics, Mount
+from groundfuse.tools.calibration_file import correction
 from groundfuse.tools.fuse_team import RunOptions
 from groundfuse.tools.pipeline import Stopwatch, accepted_edges, fuse_robots
 from groundfuse.tools.robot import Frame, Robot
-from groundfuse.tools.second_look import as_filed, corrected, correction, is_worth_it
+from groundfuse.tools.second_look import as_filed, corrected, is_worth_it
 from groundfuse.tools.settings import with_settings
 from groundfuse.tools.team_folder import read_team
 

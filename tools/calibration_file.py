@@ -17,7 +17,7 @@ import yaml
 from groundfuse.backend.bundle_estimate import BundleEstimate, Estimated, MountEstimate
 from groundfuse.backend.measurement import Attitude
 from groundfuse.frontend.arrays import Points
-from groundfuse.frontend.camera import Camera, Intrinsics, Mount
+from groundfuse.frontend.camera import Camera, Intrinsics
 from groundfuse.tools.camera_file import camera_text
 from groundfuse.tools.files import write_atomic
 from groundfuse.tools.robot import Robot
@@ -29,18 +29,22 @@ FIXED_POINT_STEPS = 20
 
 def calibrated_camera(camera: Camera, found: MountEstimate) -> Camera:
     """Return the camera with the numbers that the bundle replaced."""
-    nominal = camera.mount.attitude
-    attitude = Attitude(
-        nominal.tilt_rad + _used(found.tilt_rad),
-        nominal.roll_rad + _used(found.roll_rad),
-        nominal.height_m * (1.0 + _used(found.height)),
+    mount = replace(camera.mount, attitude=calibrated_attitude(camera.mount.attitude, found))
+    focal, term = correction(found.focal), correction(found.distortion)
+    return replace(camera, mount=mount, intrinsics=corrected_lens(camera.intrinsics, focal, term))
+
+
+def calibrated_attitude(filed: Attitude, found: MountEstimate) -> Attitude:
+    """Return a mount's or a picture's expected attitude with the numbers that were replaced."""
+    return Attitude(
+        filed.tilt_rad + correction(found.tilt_rad),
+        filed.roll_rad + correction(found.roll_rad),
+        filed.height_m * (1.0 + correction(found.height)),
     )
-    mount = Mount(attitude, camera.mount.sigma, camera.mount.base_from_foot)
-    lens = corrected_lens(camera.intrinsics, _used(found.focal), _used(found.distortion))
-    return replace(camera, mount=mount, intrinsics=lens)
 
 
-def _used(found: Estimated | None) -> float:
+def correction(found: Estimated | None) -> float:
+    """Return what the bundle adds to a file's number; 0 where it left it."""
     if found is None or not found.used or found.value is None:
         return 0.0
     return found.value

@@ -11,10 +11,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from groundfuse.backend.bundle_estimate import Estimated, FocalGains, MountEstimate
+from groundfuse.backend.bundle_estimate import FocalGains, MountEstimate
 from groundfuse.backend.bundle_tracks import gain_at
-from groundfuse.backend.measurement import Array, Attitude, Correspondences, RelativePose
-from groundfuse.tools.calibration_file import calibrated_camera
+from groundfuse.backend.measurement import Array, Correspondences, RelativePose
+from groundfuse.tools.calibration_file import (
+    calibrated_attitude,
+    calibrated_camera,
+    correction,
+)
 from groundfuse.tools.focal_gain import focal_gains
 from groundfuse.tools.robot import Robot
 
@@ -54,11 +58,6 @@ def _numbers(found: MountEstimate) -> Array:
     return np.array([correction(kind) for kind in kinds])
 
 
-def correction(found: Estimated | None) -> float:
-    """Return what the bundle adds to a file's number; 0 where it left it."""
-    return found.value if found is not None and found.used and found.value is not None else 0.0
-
-
 def corrected(robots: Sequence[Robot], mounts: Sequence[MountEstimate]) -> tuple[Robot, ...]:
     """Return the robots with the cameras that the bundle found; frames move with their mount."""
     of = {found.robot: found for found in mounts}
@@ -68,14 +67,10 @@ def corrected(robots: Sequence[Robot], mounts: Sequence[MountEstimate]) -> tuple
 
 
 def _corrected(robot: Robot, found: MountEstimate) -> Robot:
-    def moved(attitude: Attitude) -> Attitude:
-        return Attitude(
-            attitude.tilt_rad + correction(found.tilt_rad),
-            attitude.roll_rad + correction(found.roll_rad),
-            attitude.height_m * (1.0 + correction(found.height)),
-        )
-
-    frames = tuple(replace(frame, attitude=moved(frame.attitude)) for frame in robot.frames)
+    frames = tuple(
+        replace(frame, attitude=calibrated_attitude(frame.attitude, found))
+        for frame in robot.frames
+    )
     return replace(robot, camera=calibrated_camera(robot.camera, found), frames=frames)
 
 
