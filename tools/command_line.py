@@ -3,9 +3,9 @@
 import argparse
 import os
 from pathlib import Path
-from typing import NoReturn
 
 from groundfuse.tools.front_end_options import Matcher
+from groundfuse.tools.one_line_parser import OneLineParser
 
 SAMPLE = Path(__file__).resolve().parent.parent / "data" / "team"
 EPILOG = """\
@@ -20,19 +20,12 @@ them, frames.csv (times, attitudes, odometry) and groundtruth.tum (for scoring).
 """
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        """Say what is wrong in one line."""
-        self.exit(2, f"fuse_team: {message}\n")
-
-
 def parser() -> argparse.ArgumentParser:
     """Return the command line."""
-    command = _Parser(
-        prog="fuse_team.py",
-        description="Fuse the photographs of a team of ground robots into one metric floor map.",
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    command = OneLineParser(
+        "fuse_team",
+        "Fuse the photographs of a team of ground robots into one metric floor map.",
+        EPILOG,
     )
     add = command.add_argument
     add("--robots", nargs="+", metavar="NAME", help="robots to fuse (default: all in the folder)")

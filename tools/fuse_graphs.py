@@ -8,7 +8,6 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NoReturn
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # sparse solvers work on small dense blocks
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -34,6 +33,7 @@ from groundfuse.tools.graph_outputs import (
     write_tables,
 )
 from groundfuse.tools.graph_report import GraphRun, report
+from groundfuse.tools.one_line_parser import OneLineParser
 from groundfuse.tools.outputs import files_before
 from groundfuse.tools.pipeline import Stopwatch
 
@@ -52,19 +52,12 @@ Beside X.g2o, a file X.ids.json may say which robot and frame every id is.
 """
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        """Say what is wrong in one line."""
-        self.exit(2, f"fuse_graphs: {message}\n")
-
-
 def parser() -> argparse.ArgumentParser:
     """Return the command line."""
-    command = _Parser(
-        prog="fuse_graphs.py",
-        description="Fuse the pose graphs (g2o, TORO, JRL) of a team of robots into one.",
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    command = OneLineParser(
+        "fuse_graphs",
+        "Fuse the pose graphs (g2o, TORO, JRL) of a team of robots into one.",
+        EPILOG,
     )
     add = command.add_argument
     add("graphs", nargs="+", type=Path, metavar="FILE", help="one per robot, or one of all")

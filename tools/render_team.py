@@ -9,7 +9,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NoReturn
 
 # Small products only: threads inside numpy would get in each other's way.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -24,6 +23,7 @@ from groundfuse.tools.errors import DataError, TeamError
 from groundfuse.tools.floors import FLOORS
 from groundfuse.tools.horizon import border_rays, check_horizon
 from groundfuse.tools.lawn import plan_lawn
+from groundfuse.tools.one_line_parser import OneLineParser
 from groundfuse.tools.overlap import View
 from groundfuse.tools.photometry import Photometry
 from groundfuse.tools.render_files import write_picture, write_truth
@@ -58,19 +58,13 @@ examples:
 """
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        """Say what is wrong in one line."""
-        self.exit(2, f"{self.prog}: {message}\n")
-
-
 def parser() -> argparse.ArgumentParser:
     """Return the command line."""
-    command = _Parser(
-        prog="render_team.py",
-        description="Photograph an invented floor with a team of robots; every truth is written.",
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    command = OneLineParser(
+        "render_team",
+        "Photograph an invented floor with a team of robots; every truth is written.",
+        EPILOG,
+        says="render_team.py",
     )
     add = command.add_argument
     add("--out", type=Path, required=True, metavar="FOLDER", help="team folder to write")

@@ -5,7 +5,6 @@ import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 
@@ -24,6 +23,7 @@ from groundfuse.backend.team_jrl import dataset_of_team, letters_of
 from groundfuse.tools.errors import TeamError
 from groundfuse.tools.files import make_folder, write_atomic
 from groundfuse.tools.graph_outputs import ENDING, Format
+from groundfuse.tools.one_line_parser import OneLineParser
 from groundfuse.tools.outputs import csv_text
 from groundfuse.tools.simulate_graphs import TeamGraphs, TeamShape, simulate
 
@@ -40,20 +40,13 @@ wrong_edges.csv; with --format jrl all of it in one file, team.jrl.
 """
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        """Say what is wrong in one line."""
-        self.exit(2, f"simulate_team: {message}\n")
-
-
 def parser() -> argparse.ArgumentParser:
     """Return the command line."""
     plain = TeamShape()
-    command = _Parser(
-        prog="simulate_team.py",
-        description="Simulate the pose graphs of a team of robots, with known truth.",
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    command = OneLineParser(
+        "simulate_team",
+        "Simulate the pose graphs of a team of robots, with known truth.",
+        EPILOG,
     )
     add = command.add_argument
     add("--robots", type=int, default=plain.robots, metavar="N", help="how many (2)")
