@@ -65,7 +65,13 @@ def build_mosaic(
     """
     options = options or MosaicOptions()
     limit = min(options.max_cells, options.memory_cells)
-    plan = plan_mosaic(views, replace(options, max_cells=limit))
+    return planned_mosaic(plan_mosaic(views, replace(options, max_cells=limit)), options, progress)
+
+
+def planned_mosaic(
+    plan: MosaicPlan, options: MosaicOptions, progress: Callable[[int, int], None] | None = None
+) -> Mosaic:
+    """Carry out a plan whose cells fit into memory; see `build_mosaic`."""
     layers = _blank_layers(plan)
     for block, tile in mosaic_tiles(plan, options, progress):
         layers.floor[block], layers.mean[block] = tile.floor, tile.mean

@@ -1,15 +1,13 @@
 """The tiles of a mosaic one after the other, however many there are; only a few are ever held."""
 
 import math
-from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from itertools import islice
-from typing import TypeVar
 
 import numpy as np
 
+from groundfuse.frontend.ahead import in_order
 from groundfuse.frontend.area_remap import area_remap
 from groundfuse.frontend.arrays import Image
 from groundfuse.frontend.exposure_samples import merged, sample_exposure
@@ -28,8 +26,6 @@ from groundfuse.frontend.sight import sight
 AHEAD_PER_WORKER = 3
 """Tiles being made or waiting to be taken, for each thread."""
 
-Item = TypeVar("Item")
-Result = TypeVar("Result")
 Block = tuple[slice, slice]
 """Rows and columns of the grid."""
 Told = Callable[[int, int], None]
@@ -83,32 +79,10 @@ def mosaic_tiles(
             return _tile(scene, *item)
 
         ahead = AHEAD_PER_WORKER * options.workers
-        for (block, _), tile in _in_order(threads, work, blocks, ahead):
+        for (block, _), tile in zip(blocks, in_order(threads, work, blocks, ahead), strict=True):
             told.step()
             if tile is not None:
                 yield block, tile
-
-
-def _in_order(
-    threads: ThreadPoolExecutor,
-    work: Callable[[Item], Result],
-    items: list[Item],
-    ahead: int,
-) -> Iterator[tuple[Item, Result]]:
-    """Yield items with their results, never more than `ahead` of them begun and not yet taken."""
-    left = iter(items)
-    begun: deque[tuple[Item, Future[Result]]] = deque()
-    for item in islice(left, ahead):
-        begun.append((item, threads.submit(work, item)))
-    try:
-        while begun:
-            first, future = begun.popleft()
-            yield first, future.result()
-            for item in islice(left, 1):
-                begun.append((item, threads.submit(work, item)))
-    finally:
-        for _, future in begun:
-            future.cancel()
 
 
 def _checked_load(view: MosaicView) -> Callable[[], Image]:

@@ -9,6 +9,7 @@ import numpy as np
 from groundfuse.backend.bundle_estimate import BundleEstimate
 from groundfuse.backend.drift import accuracy
 from groundfuse.backend.measurement import Attitude, FrameId, Se2, TeamEstimate
+from groundfuse.frontend.ahead import Result
 from groundfuse.frontend.camera import Camera
 from groundfuse.tools.errors import TeamError
 from groundfuse.tools.pipeline import (
@@ -19,7 +20,6 @@ from groundfuse.tools.pipeline import (
     fuse_robots,
 )
 from groundfuse.tools.robot import Robot
-from groundfuse.tools.workers import Result
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -23,6 +23,7 @@ import cv2
 import numpy as np
 
 from groundfuse.backend.measurement import Attitude, RelativePose, Se2
+from groundfuse.frontend.ahead import Result
 from groundfuse.frontend.camera import Camera, Intrinsics, Mount
 from groundfuse.frontend.repetition import REPEATS
 from groundfuse.tools import render_team
@@ -32,7 +33,6 @@ from groundfuse.tools.pair_verdict import Seen, compare, look
 from groundfuse.tools.pipeline import PipelineOptions, Stopwatch, fuse_robots
 from groundfuse.tools.robot import Frame, Robot
 from groundfuse.tools.team_folder import read_team
-from groundfuse.tools.workers import Result
 from groundfuse.tools.world import RenderedFrame, RenderedTeam, RobotSpec, make_team
 
 RIGHT_M, RIGHT_RAD = 0.030, math.radians(3.0)

@@ -15,6 +15,7 @@ import numpy as np
 
 from groundfuse.backend.drift import accuracy
 from groundfuse.backend.measurement import FrameId
+from groundfuse.frontend.ahead import Result
 from groundfuse.frontend.features import FeatureOptions, detect
 from groundfuse.frontend.mosaic import MosaicOptions
 from groundfuse.frontend.retrieval import RetrievalOptions, learned, votes
@@ -30,7 +31,7 @@ from groundfuse.tools.render_files import picture_name
 from groundfuse.tools.robot import Frame, Robot
 from groundfuse.tools.robot_folder import IMAGES
 from groundfuse.tools.store import Store
-from groundfuse.tools.workers import Result, Threads
+from groundfuse.tools.workers import Threads
 
 SAME_FLOOR = 0.3
 """Overlap from which a guess counts as right."""

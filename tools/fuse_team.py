@@ -20,6 +20,7 @@ import cv2
 from tqdm import tqdm
 
 from groundfuse.backend.bundle_estimate import BundleEstimate
+from groundfuse.frontend.ahead import Result
 from groundfuse.frontend.mosaic import MosaicOptions
 from groundfuse.tools.calibration_file import write_calibrations
 from groundfuse.tools.closing_table import closing_table
@@ -60,7 +61,7 @@ from groundfuse.tools.settings import record, with_settings
 from groundfuse.tools.store import STORE, Store
 from groundfuse.tools.team_folder import list_robots, read_team
 from groundfuse.tools.view3d import view_ply, write_ply
-from groundfuse.tools.workers import Result, Threads, Workers
+from groundfuse.tools.workers import Threads, Workers
 
 log = logging.getLogger(__name__)
 

@@ -11,7 +11,13 @@ from tqdm import tqdm
 
 from groundfuse.backend.measurement import FrameId, Rejected, RelativePose
 from groundfuse.frontend.arrays import Image
-from groundfuse.frontend.mosaic import Mosaic, MosaicOptions, MosaicView, build_mosaic
+from groundfuse.frontend.mosaic import (
+    Mosaic,
+    MosaicOptions,
+    MosaicView,
+    build_mosaic,
+    planned_mosaic,
+)
 from groundfuse.frontend.mosaic_plan import plan_mosaic
 from groundfuse.frontend.mosaic_preview import Preview, reduction
 from groundfuse.frontend.mosaic_stream import Told, mosaic_tiles
@@ -73,7 +79,7 @@ def _mosaic(path: Path, views: Sequence[MosaicView], options: MosaicOptions, tol
     plan = plan_mosaic(views, options)
     cells = plan.grid.rows * plan.grid.columns
     if cells <= options.memory_cells:
-        return build_mosaic(views, options, told)
+        return planned_mosaic(plan, options, told)
     if not can_write():
         mosaic = build_mosaic(views, options, told)
         log.warning(

@@ -1,10 +1,10 @@
 """Who does the work: threads of this process, and what stands in their place on a cluster."""
 
-from collections import deque
 from collections.abc import Callable, Generator, Iterable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Protocol, TypeVar
+from concurrent.futures import ThreadPoolExecutor
+from typing import Protocol
 
+from groundfuse.frontend.ahead import Item, Result, in_order
 from groundfuse.tools.frame_look import LookJob, look_done, picture_of
 from groundfuse.tools.front_end_options import FrontEndOptions
 from groundfuse.tools.pair_verdict import PairJob, pair_done
@@ -12,8 +12,6 @@ from groundfuse.tools.shelf import Shelf
 
 AHEAD = 4
 """Items begun per thread before the first is taken."""
-Item = TypeVar("Item")
-Result = TypeVar("Result")
 
 
 class Progress(Protocol):
@@ -76,15 +74,5 @@ def in_threads(
     if num_threads == 1:
         yield from map(work, items)
         return
-    begun: deque[Future[Result]] = deque()
     with ThreadPoolExecutor(num_threads) as pool:
-        try:
-            for item in items:
-                begun.append(pool.submit(work, item))
-                if len(begun) >= AHEAD * num_threads:
-                    yield begun.popleft().result()
-            while begun:
-                yield begun.popleft().result()
-        finally:
-            for future in begun:
-                future.cancel()
+        yield from in_order(pool, work, items, AHEAD * num_threads)
