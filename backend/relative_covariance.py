@@ -11,7 +11,8 @@ import numpy as np
 
 from groundfuse.backend import planar, sparse
 from groundfuse.backend.initial import layout_of
-from groundfuse.backend.problem import Array, Problem, components, linearised
+from groundfuse.backend.problem import Array, Problem, components
+from groundfuse.backend.solver import normal_equations
 
 
 def relative_covariances(
@@ -36,10 +37,8 @@ def relative_covariances(
     layout = layout_of(problem)
     if not pairs:
         return []
-    linear = linearised(problem, poses)
-    left_a, left_b = (np.swapaxes(m, 1, 2) @ problem.information for m in linear[1:])
-    aa, ab, bb = left_a @ linear.by_a, left_a @ linear.by_b, left_b @ linear.by_b
-    factor = sparse.factorised(sparse.assembled(sparse.filling(layout, 3), aa, ab, bb))
+    matrix, _ = normal_equations(problem, poses, layout)
+    factor = sparse.factorised(matrix)
     found = []
     for a, b in pairs:
         joint = np.zeros((6, 6))

@@ -15,10 +15,9 @@ from groundfuse.backend.team_jrl import dataset_of_team, keys_with_letters, lett
 from groundfuse.backend.team_solution import Solution, as_rows, residuals_of
 from groundfuse.tools.errors import TeamError
 from groundfuse.tools.files import write_atomic
-from groundfuse.tools.outputs import component_name, csv_text
+from groundfuse.tools.outputs import POSE, component_name, csv_text, pose_cells
 
-SIGMAS = ("sigma_x_m", "sigma_y_m", "sigma_theta_deg")
-POSE_COLUMNS = ("robot", "index", "id", "component", "x_m", "y_m", "theta_deg", *SIGMAS)
+POSE_COLUMNS = ("robot", "index", "id", "component", *POSE)
 EDGE_COLUMNS = (
     *("a", "b", "kind", "verdict", "weight", "chi2", "limit", "reason"),
     *("residual_x_m", "residual_y_m", "residual_theta_deg", "place"),
@@ -61,15 +60,8 @@ def write_tables(out: Path, team: TeamGraph, estimate: TeamEstimate) -> None:
 
 
 def _pose_row(frame: FrameId, team: TeamGraph, estimate: TeamEstimate) -> list[Any]:
-    covariance = estimate.covariance.get(frame)
-    sigma: list[float | None] = [None] * 3
-    if covariance is not None:
-        x, y, turn = (math.sqrt(covariance[k, k]) for k in range(3))
-        sigma = [x, y, math.degrees(turn)]
-    pose = estimate.team_from_base[frame]
-    where = [pose.x_m, pose.y_m, math.degrees(pose.theta_rad)]
     name = [frame.robot, frame.index, team.key_of[frame], estimate.component_of[frame]]
-    return [*name, *where, *sigma]
+    return [*name, *pose_cells(estimate.team_from_base[frame], estimate.covariance.get(frame))]
 
 
 def verdict_word(verdict: EdgeVerdict) -> str:

@@ -12,6 +12,7 @@ from typing import Any
 from groundfuse.backend import g2o
 from groundfuse.backend.bundle_estimate import BundleEstimate
 from groundfuse.backend.measurement import (
+    Array,
     EdgeVerdict,
     FrameId,
     Rejected,
@@ -95,18 +96,16 @@ def _pair_order(row: Sequence[Any]) -> tuple[FrameId, FrameId]:
 
 
 def _accepted_row(edge: RelativePose, graph: EdgeVerdict, late: Rejected | None) -> list[Any]:
-    z, c = edge.a_from_b, edge.covariance
     verdict: list[Any] = ["used", None, None, None]
     if graph.reason is not None:
         verdict = ["turned_down", graph.reason.value, graph.chi2, graph.limit]
     elif late is not None:
         verdict = ["turned_down", late.reason.value, late.value, late.limit]
-    sigma = [math.sqrt(c[0, 0]), math.sqrt(c[1, 1]), math.degrees(math.sqrt(c[2, 2]))]
-    pose = [z.x_m, z.y_m, math.degrees(z.theta_rad)]
+    pose = pose_cells(edge.a_from_b, edge.covariance)
     found = [edge.num_inliers, edge.ambiguity, graph.chi2]
-    seen = gamma(z)
+    seen = gamma(edge.a_from_b)
     bearings = [seen.rho_m, math.degrees(seen.phi1_rad), math.degrees(seen.phi2_rad)]
-    return [edge.a, edge.b, *verdict, *pose, *sigma, *bearings, *found]
+    return [edge.a, edge.b, *verdict, *pose, *bearings, *found]
 
 
 def _rejected_row(rejected: Rejected) -> list[Any]:
@@ -171,15 +170,19 @@ def write_poses(out: Path, fused: Fused) -> None:
     best, frames = fused.best, fused.frames
     rows: list[list[Any]] = []
     for frame, pose in sorted(best.team_from_base.items()):
-        covariance = best.covariance.get(frame)
-        sigma: list[float | None] = [None] * 3
-        if covariance is not None:
-            xy = covariance[0, 0], covariance[1, 1]
-            sigma = [*map(math.sqrt, xy), math.degrees(math.sqrt(covariance[2, 2]))]
-        where = [pose.x_m, pose.y_m, math.degrees(pose.theta_rad)]
+        where = pose_cells(pose, best.covariance.get(frame))
         image = frames[frame][1].path.name
-        rows.append([frame.robot, frame.index, image, best.component_of[frame], *where, *sigma])
+        rows.append([frame.robot, frame.index, image, best.component_of[frame], *where])
     write_atomic(out / "poses.csv", csv_text(POSE_COLUMNS, rows))
+
+
+def pose_cells(pose: Se2, covariance: Array | None) -> list[float | None]:
+    """Return m, m, deg and their standard deviations, empty where there are none."""
+    where = [pose.x_m, pose.y_m, math.degrees(pose.theta_rad)]
+    if covariance is None:
+        return [*where, None, None, None]
+    x_m, y_m, theta_rad = (math.sqrt(covariance[k, k]) for k in range(3))
+    return [*where, x_m, y_m, math.degrees(theta_rad)]
 
 
 def write_attitudes(out: Path, fused: Fused) -> None:
