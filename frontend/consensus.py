@@ -7,6 +7,7 @@ repeats, the neighbours spread over the repeats and the second-best motion gets 
 as the best, which no count of inliers would show.
 """
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,6 +15,9 @@ import numpy as np
 
 from groundfuse.backend.measurement import Se2
 from groundfuse.frontend.arrays import Floats, Mask, Points
+from groundfuse.frontend.consensus_draws import allowed, distinct, draw
+from groundfuse.frontend.consensus_table import Limits, Table
+from groundfuse.frontend.consensus_votes import climb, count_votes
 
 
 class Candidates(NamedTuple):
@@ -111,198 +115,77 @@ def find_modes(
     """
     if len(found.index_a) < 2:
         return []
-    hypotheses = _drawn(found, tolerance_m, max_log_scale, options, rng)
-    centre = np.median(found.floor_b, axis=0)
-    if gate is not None:
-        hypotheses = hypotheses[_within(gate, hypotheses, found.floor_b, tolerance_m)]
-    if len(hypotheses) == 0:
-        return []
-    hypotheses = hypotheses[: options.max_hypotheses]
-    votes = _votes(found, hypotheses, tolerance_m, options.max_turn_rad)
-    motions: list[Floats] = []
+    table = _table(found)
+    limits = _limits(found, tolerance_m, max_log_scale, options, gate)
+    motions = np.empty((options.max_hypotheses, 4))
+    motions = motions[: draw(table, rng.random((2, options.num_draws)), limits, motions)]
+    votes = np.zeros(len(motions), dtype=np.int64)
+    count_votes(table.slots(), motions, limits, votes)
     modes: list[Mode] = []
-    while len(hypotheses) and len(modes) < options.num_modes:
-        start = hypotheses[int(np.argmax(votes))]
-        best, count = _refined(found, start, tolerance_m, max_log_scale, options)
+    known = np.empty((options.num_modes, 4))
+    while len(motions) and len(modes) < options.num_modes:
+        start = motions[int(np.argmax(votes))]
+        best, voters = start.copy(), np.zeros(len(found.index_a), dtype=np.bool_)
+        count = climb(table, best, limits, options.refinements, voters)
         # A start on the slope of a known mode climbs back to it: no rival. One at the edge of the
         # gate may climb out of it.
-        known = any(
-            not _distinct(other[None], best, centre, tolerance_m, options)[0] for other in motions
-        )
-        inside = gate is None or _within(gate, best[None], found.floor_b, tolerance_m)[0]
-        if inside and not known:
-            motions.append(best)
-            modes.append(_mode(found, best, count, tolerance_m, options))
-        apart = _distinct(hypotheses, best, centre, tolerance_m, options)
-        apart &= _distinct(hypotheses, start, centre, tolerance_m, options)
-        hypotheses, votes = hypotheses[apart], votes[apart]
+        if allowed(best, limits) and distinct(known[: len(modes)], best, limits).all():
+            known[len(modes)] = best
+            modes.append(_mode(best, count, voters))
+        apart = distinct(motions, best, limits) & distinct(motions, start, limits)
+        motions, votes = motions[apart], votes[apart]
     return sorted(modes, key=lambda mode: -mode.votes)
 
 
-def _mode(
-    found: Candidates, motion: Floats, votes: int, tolerance_m: float, options: ConsensusOptions
-) -> Mode:
-    heading = float(np.arctan2(motion[1], motion[0]))
-    return Mode(
-        Se2(float(motion[2]), float(motion[3]), heading),
-        float(np.hypot(motion[0], motion[1])),
-        one_to_one(found, motion, tolerance_m, options.max_turn_rad),
-        votes,
+def _table(found: Candidates) -> Table:
+    """Lay candidates out for the compiled loops."""
+    change = np.flatnonzero(found.index_a[1:] != found.index_a[:-1]) + 1
+    return Table(
+        np.hstack([found.floor_a, found.floor_b]),
+        np.column_stack([np.cos(found.turn_rad), np.sin(found.turn_rad)]).astype(np.float32),
+        np.cumsum(1.0 / (1.0 + found.rank)),
+        np.concatenate([[0], change, [len(found.index_a)]]),
+        found.index_b,
+        int(found.index_b.max()) + 1,
     )
 
 
-def _drawn(
+def _limits(
     found: Candidates,
     tolerance_m: float,
     max_log_scale: float,
     options: ConsensusOptions,
-    rng: np.random.Generator,
-) -> Floats:
-    """Hypotheses (m, 4) `s cos, s sin, x, y` of drawn pairs that pass the segment test."""
-    weight = 1.0 / (1.0 + found.rank)
-    cumulative = np.cumsum(weight)
-    draws = rng.random((2, options.num_draws)) * cumulative[-1]
-    one, two = np.searchsorted(cumulative, draws)
-    in_a = found.floor_a[two] - found.floor_a[one]
-    in_b = found.floor_b[two] - found.floor_b[one]
-    length_a, length_b = np.hypot(*in_a.T), np.hypot(*in_b.T)
-    shortest = options.min_baseline_tolerances * tolerance_m
-    stretch = np.expm1(max_log_scale) * length_b
-    ok = (np.minimum(length_a, length_b) > shortest) & (
-        np.abs(length_a - length_b) < 2.0 * tolerance_m + stretch
+    gate: Gate | None,
+) -> Limits:
+    """Return what is asked of a motion; a gate gives way by the tolerance that wobble needs."""
+    centre = np.median(found.floor_b, axis=0)
+    size_m = float(np.sqrt(((found.floor_b - centre) ** 2).sum(axis=1).mean()))
+    expected, gate_m, gate_rad = np.array([1.0, 0.0, 0.0, 0.0]), np.inf, np.inf
+    if gate is not None:
+        expected = _coefficients(gate.a_from_b)
+        gate_m = gate.radius_m + tolerance_m
+        gate_rad = gate.turn_rad + tolerance_m / max(size_m, tolerance_m)
+    return Limits(
+        tolerance_m,
+        math.cos(options.max_turn_rad),
+        math.exp(max_log_scale),
+        options.min_baseline_tolerances * tolerance_m,
+        options.distinct_tolerances * tolerance_m,
+        options.distinct_turn_rad,
+        float(centre[0]),
+        float(centre[1]),
+        expected,
+        gate_m,
+        math.hypot(*centre),
+        gate_rad,
     )
-    one, two, in_a, in_b = one[ok], two[ok], in_a[ok], in_b[ok]
-    length_a, length_b = length_a[ok], length_b[ok]
-    turn = np.arctan2(in_a[:, 1], in_a[:, 0]) - np.arctan2(in_b[:, 1], in_b[:, 0])
-    agree = np.ones(len(turn), dtype=bool)
-    for end in (one, two):
-        error = np.abs(np.remainder(turn - found.turn_rad[end] + np.pi, 2 * np.pi) - np.pi)
-        agree &= ~(error > options.max_turn_rad)
-    keep = np.flatnonzero(agree)
-    one, two, turn = one[keep], two[keep], turn[keep]
-    ratio = np.log(length_a[keep] / length_b[keep])
-    scale = np.exp(np.clip(ratio, -max_log_scale, max_log_scale))
-    c, s = scale * np.cos(turn), scale * np.sin(turn)
-    middle_a = (found.floor_a[one] + found.floor_a[two]) / 2.0
-    middle_b = (found.floor_b[one] + found.floor_b[two]) / 2.0
-    x = middle_a[:, 0] - c * middle_b[:, 0] + s * middle_b[:, 1]
-    y = middle_a[:, 1] - s * middle_b[:, 0] - c * middle_b[:, 1]
-    return np.stack([c, s, x, y], axis=1)
-
-
-def _residual(found: Candidates, motions: Floats) -> Floats:
-    """Squared distances (m, n) between a and moved b."""
-    c, s, x, y = (motions[:, k, None].astype(np.float32) for k in range(4))
-    ax, ay = found.floor_a.astype(np.float32).T
-    bx, by = found.floor_b.astype(np.float32).T
-    dx = c * bx - s * by + (x - ax)
-    dy = s * bx + c * by + (y - ay)
-    squared: Floats = dx * dx + dy * dy
-    return squared
-
-
-def _near(found: Candidates, motions: Floats, tolerance_m: float, max_turn_rad: float) -> Mask:
-    """Which candidates (m, n) lie within tolerance and are turned as the motion turns them."""
-    near = _residual(found, motions) < tolerance_m**2
-    cos_turn = np.cos(found.turn_rad).astype(np.float32)
-    sin_turn = np.sin(found.turn_rad).astype(np.float32)
-    length = np.hypot(motions[:, 0], motions[:, 1])[:, None]
-    c, s = (motions[:, :2].T[:, :, None] / length).astype(np.float32)
-    voting: Mask = near & ~(c * cos_turn + s * sin_turn < np.cos(max_turn_rad))
-    return voting
-
-
-def _votes(
-    found: Candidates, motions: Floats, tolerance_m: float, max_turn_rad: float
-) -> np.ndarray:
-    """Features of a with a candidate within tolerance, per motion (m,)."""
-    near = _near(found, motions, tolerance_m, max_turn_rad)
-    starts = np.flatnonzero(np.r_[True, found.index_a[1:] != found.index_a[:-1]])
-    votes: np.ndarray = np.logical_or.reduceat(near, starts, axis=1).sum(axis=1)
-    return votes
-
-
-def _refined(
-    found: Candidates,
-    motion: Floats,
-    tolerance_m: float,
-    max_log_scale: float,
-    options: ConsensusOptions,
-) -> tuple[Floats, int]:
-    """Least squares over the voters, kept while the votes do not fall."""
-    votes = int(_votes(found, motion[None], tolerance_m, options.max_turn_rad)[0])
-    for _ in range(options.refinements):
-        near = one_to_one(found, motion, tolerance_m, options.max_turn_rad)
-        if near.sum() < 2:
-            break
-        candidate = _procrustes(found.floor_a[near], found.floor_b[near], max_log_scale)
-        count = int(_votes(found, candidate[None], tolerance_m, options.max_turn_rad)[0])
-        if count < votes:
-            break
-        motion, votes = candidate, count
-    return motion, votes
-
-
-def _procrustes(a: Points, b: Points, max_log_scale: float) -> Floats:
-    """Best motion (4,) from b to a; with scale unless `max_log_scale` is 0 (Umeyama 1991)."""
-    mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
-    da, db = a - mean_a, b - mean_b
-    c, s = float((da * db).sum()), float((da[:, 1] * db[:, 0] - da[:, 0] * db[:, 1]).sum())
-    length = np.hypot(c, s)
-    if length == 0.0:
-        return np.array([1.0, 0.0, *(mean_a - mean_b)])
-    scale = 1.0
-    if max_log_scale > 0.0:
-        scale = float(
-            np.clip(length / (db**2).sum(), np.exp(-max_log_scale), np.exp(max_log_scale))
-        )
-    c, s = scale * c / length, scale * s / length
-    shift = mean_a - np.array([c * mean_b[0] - s * mean_b[1], s * mean_b[0] + c * mean_b[1]])
-    return np.array([c, s, *shift])
 
 
 def _coefficients(motion: Se2) -> Floats:
     return np.array([np.cos(motion.theta_rad), np.sin(motion.theta_rad), motion.x_m, motion.y_m])
 
 
-def _apart(motions: Floats, other: Floats, centre: Floats) -> tuple[Floats, Floats]:
-    """How far motions (m, 4) differ from another at the centre of view b (m), and in turn (rad)."""
-    change = motions - other
-    dx = change[:, 0] * centre[0] - change[:, 1] * centre[1] + change[:, 2]
-    dy = change[:, 1] * centre[0] + change[:, 0] * centre[1] + change[:, 3]
-    turn = np.arctan2(motions[:, 1], motions[:, 0]) - np.arctan2(other[1], other[0])
-    return np.hypot(dx, dy), np.abs(np.remainder(turn + np.pi, 2 * np.pi) - np.pi)
-
-
-def _within(gate: Gate, motions: Floats, floor_b: Points, tolerance_m: float) -> Mask:
-    """Which motions (m, 4) a gate allows, give or take the tolerance that wobble needs.
-
-    Judged at the view's centre, where a motion is known best; a turn swings it about foot b.
-    """
-    centre = np.median(floor_b, axis=0)
-    size = np.sqrt(((floor_b - centre) ** 2).sum(axis=1).mean())
-    far, turn = _apart(motions, _coefficients(gate.a_from_b), centre)
-    near = far <= gate.radius_m + turn * np.hypot(*centre) + tolerance_m
-    allowed: Mask = near & (turn <= gate.turn_rad + tolerance_m / max(size, tolerance_m))
-    return allowed
-
-
-def _distinct(
-    motions: Floats, other: Floats, centre: Floats, tolerance_m: float, options: ConsensusOptions
-) -> Mask:
-    far, turn = _apart(motions, other, centre)
-    apart: Mask = far > options.distinct_tolerances * tolerance_m
-    return apart | (turn > options.distinct_turn_rad)
-
-
-def one_to_one(found: Candidates, motion: Floats, tolerance_m: float, max_turn_rad: float) -> Mask:
-    """Return the nearest voter of each feature of a, then of each feature of b."""
-    squared = _residual(found, motion[None])[0]
-    near = np.flatnonzero(_near(found, motion[None], tolerance_m, max_turn_rad)[0])
-    order = near[np.argsort(squared[near], kind="stable")]
-    _, first = np.unique(found.index_a[order], return_index=True)
-    order = order[np.sort(first)]
-    _, first = np.unique(found.index_b[order], return_index=True)
-    voters = np.zeros(len(found.index_a), dtype=bool)
-    voters[order[first]] = True
-    return voters
+def _mode(motion: Floats, votes_of: int, voters: Mask) -> Mode:
+    heading = float(np.arctan2(motion[1], motion[0]))
+    scale = float(np.hypot(motion[0], motion[1]))
+    return Mode(Se2(float(motion[2]), float(motion[3]), heading), scale, voters, votes_of)

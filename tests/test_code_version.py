@@ -74,4 +74,4 @@ def test_a_library_counts_where_it_is_imported(monkeypatch):
     after = [code_of.__wrapped__(m) for m in (FEATURES, "groundfuse.backend.team")]
     assert after[0] != before[0]
     assert after[1] == before[1]
-    assert set(libraries()) == {"python", "machine", "cv2", "gtsam", "numpy", "scipy"}
+    assert set(libraries()) == {"python", "machine", "cv2", "gtsam", "numba", "numpy", "scipy"}

@@ -14,13 +14,13 @@ from groundfuse.frontend.consensus import (
     Candidates,
     ConsensusOptions,
     Gate,
-    _apart,
     _coefficients,
-    _drawn,
-    _procrustes,
+    _limits,
+    _table,
     find_modes,
-    one_to_one,
 )
+from groundfuse.frontend.consensus_draws import _apart, _guide, _picked, draw
+from groundfuse.frontend.consensus_votes import _fit, climb, count_votes
 
 TOLERANCE_M = 0.01
 OPTIONS = ConsensusOptions(num_draws=8000)
@@ -53,6 +53,15 @@ def planted(rng, motions=(TRUTH,), right=40, wrong=120, scale=1.0, noise_m=0.001
         np.concatenate(rank),
         np.concatenate(turn),
     )
+
+
+def limits(found, *, scales=0.0, options=OPTIONS, tolerance_m=TOLERANCE_M):
+    return _limits(found, tolerance_m, scales, options, None)
+
+
+def plain(function):
+    """Return what was compiled as Python sees it."""
+    return function.py_func
 
 
 def modes(found, *, scales=0.0, options=OPTIONS, gate=None, seed=0):
@@ -94,24 +103,44 @@ def test_the_planted_motion_is_found(truth, seed, turned):
 
 @given(poses, poses, st.floats(-2, 2), st.floats(-2, 2))
 def test_motions_are_compared_at_the_view(one, other, x, y):
-    centre = np.array([x, y])
-    place, turn = _apart(_coefficients(one)[None], _coefficients(other), centre)
-    moved = one.apply(centre[None]) - other.apply(centre[None])
-    assert place[0] == pytest.approx(np.hypot(*moved[0]), abs=1e-12)
+    asked = limits(planted(np.random.default_rng(0)))._replace(centre_x_m=x, centre_y_m=y)
+    place, turn = plain(_apart)(_coefficients(one), _coefficients(other), asked)
+    moved = one.apply(np.array([[x, y]])) - other.apply(np.array([[x, y]]))
+    assert place == pytest.approx(np.hypot(*moved[0]), abs=1e-12)
     between = abs((one.inverse() @ other).theta_rad)
-    assert turn[0] == pytest.approx(between, abs=1e-12)
+    assert turn == pytest.approx(between, abs=1e-12)
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.15, 0.9])
 def test_every_draw_from_exact_matches_is_the_motion(scale):
     """Without noise or wrong candidates; nearly all pairs of points are long enough."""
     exact = planted(np.random.default_rng(13), wrong=0, noise_m=0.0, scale=scale)
-    most = 0.0 if scale == 1.0 else 0.2
-    drawn = _drawn(exact, TOLERANCE_M, most, OPTIONS, np.random.default_rng(0))
+    asked = limits(exact, scales=0.0 if scale == 1.0 else 0.2)
+    draws = np.random.default_rng(0).random((2, 2000))
+    motions = np.empty((2000, 4))
+    count = draw(_table(exact), draws, asked, motions)
     c, s = math.cos(TRUTH.theta_rad), math.sin(TRUTH.theta_rad)
     wanted = [scale * c, scale * s, TRUTH.x_m, TRUTH.y_m]
-    np.testing.assert_allclose(drawn, np.broadcast_to(wanted, drawn.shape), atol=1e-12)
-    assert len(drawn) > 0.9 * OPTIONS.num_draws
+    np.testing.assert_allclose(motions[:count], np.broadcast_to(wanted, (count, 4)), atol=1e-12)
+    assert count > 0.9 * 2000
+    # Drawing ends where there is no more room, with the same motions so far.
+    few = np.empty((10, 4))
+    assert draw(_table(exact), draws, asked, few) == 10
+    np.testing.assert_array_equal(few, motions[:10])
+
+
+@given(st.integers(0, 2**16))
+@settings(max_examples=20, deadline=None)
+def test_a_draw_takes_the_candidate_that_its_weight_gives_it(seed):
+    """Against bisection, shares at the very borders included."""
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(1, 40))
+    cumulative = np.cumsum(1.0 / rng.integers(1, 6, count))
+    guide = plain(_guide)(cumulative)
+    borders = np.minimum(cumulative / cumulative[-1], 1.0 - 2.0**-53)
+    for share in [0.0, *rng.random(200), *borders, *np.nextafter(borders, 0.0)]:
+        wanted = np.searchsorted(cumulative, share * cumulative[-1])
+        assert plain(_picked)(share, cumulative, guide) == wanted
 
 
 @given(
@@ -132,17 +161,26 @@ def test_least_squares_over_the_voters(truth, scale, seed):
         ]
     )
     linear = np.linalg.lstsq(design, np.concatenate([a[:, 0], a[:, 1]]), rcond=None)[0]
-    found = _procrustes(a, b, 0.5)
+
+    def fitted(most):
+        index = np.arange(20)
+        table = _table(Candidates(a, b, index, index, 0 * index, np.zeros(20)))
+        motion = np.empty(4)
+        asked = limits(planted(rng))._replace(max_scale=math.exp(most))
+        assert plain(_fit)(table, np.ones(20, dtype=bool), asked, motion)
+        return motion
+
+    found = fitted(0.5)
     # The scale of the linear solution is that of b to a: the same sum of squares.
     np.testing.assert_allclose(found, linear, atol=1e-9)
-    rigid = _procrustes(a, b, 0.0)
+    rigid = fitted(0.0)
     assert np.hypot(*rigid[:2]) == pytest.approx(1.0)
     assert math.atan2(rigid[1], rigid[0]) == pytest.approx(math.atan2(linear[1], linear[0]))
     np.testing.assert_allclose(
         Se2(rigid[2], rigid[3], math.atan2(rigid[1], rigid[0])).apply(b).mean(axis=0),
         a.mean(axis=0),
     )
-    narrow = _procrustes(a, b, 0.01)
+    narrow = fitted(0.01)
     assert abs(math.log(np.hypot(*narrow[:2]))) <= 0.01 + 1e-12
 
 
@@ -303,7 +341,10 @@ def test_voters_are_one_to_one_and_the_nearest(seed):
     index_b = rng.integers(0, 15, count)
     found = Candidates(*floor, index_a, index_b, np.zeros(count, int), np.zeros(count))
     motion = np.array([1.0, 0.0, 0.002, 0.001])
-    voters = one_to_one(found, motion, 0.02, 0.5)
+    options = dataclasses.replace(OPTIONS, max_turn_rad=0.5)
+    voters = np.empty(count, dtype=bool)
+    asked = limits(found, options=options, tolerance_m=0.02)
+    climb(_table(found), motion, asked, 0, voters)
     distance = np.hypot(*(floor[1] + motion[2:] - floor[0]).T)
     near = distance < 0.02
     assert not voters[~near].any()
@@ -317,3 +358,28 @@ def test_voters_are_one_to_one_and_the_nearest(seed):
             chosen = voters & (index_b == index_b[i])
             assert chosen.any()
             assert distance[chosen][0] <= distance[i]
+
+
+@given(st.integers(0, 2**16), st.booleans())
+@settings(deadline=None, max_examples=20)
+def test_votes_are_those_of_whole_matrices(seed, scaled):
+    """Every motion against every candidate at once; some without orientation."""
+    rng = np.random.default_rng(seed)
+    found = planted(rng, wrong=60)
+    turn = np.where(rng.random(len(found.turn_rad)) < 0.2, np.nan, found.turn_rad)
+    found = found._replace(turn_rad=turn, index_a=np.sort(rng.integers(0, 50, len(turn))))
+    motions = np.array([_coefficients(TRUTH)] * 30) + rng.normal(0.0, 0.02, (30, 4))
+    motions[:, :2] *= 1.1 if scaled else 1.0
+    asked, table = limits(found, tolerance_m=0.03), _table(found)
+    counts = np.empty(30, dtype=np.int64)
+    count_votes(table.slots(), motions, asked, counts)
+    c, s, x, y = (motions[:, k, None] for k in range(4))
+    dx = c * found.floor_b[:, 0] - s * found.floor_b[:, 1] + x - found.floor_a[:, 0]
+    dy = s * found.floor_b[:, 0] + c * found.floor_b[:, 1] + y - found.floor_a[:, 1]
+    off = np.abs(np.remainder(np.arctan2(s, c) - turn + np.pi, 2 * np.pi) - np.pi)
+    agree = (np.hypot(dx, dy) < 0.03) & ~(off > OPTIONS.max_turn_rad)
+    wanted = [len(set(found.index_a[row])) for row in agree]
+    # Single precision moves a border by 1e-7; none of the candidates is so near to one.
+    np.testing.assert_array_equal(counts, wanted)
+    for motion, votes in zip(motions, wanted, strict=True):
+        assert climb(table, motion.copy(), asked, 0, np.empty(len(turn), dtype=bool)) == votes

@@ -20,7 +20,7 @@ IMPORTS = re.compile(
     r"|^[ \t]*import[ \t]+(groundfuse[.\w]*)",
     re.MULTILINE,
 )
-LIBRARIES = ("cv2", "gtsam", "numpy", "scipy")
+LIBRARIES = ("cv2", "gtsam", "numba", "numpy", "scipy")
 
 
 @functools.cache
