@@ -4,7 +4,7 @@ A camera that nods by half a degree moves the floor by a centimetre, and each pa
 differently; a frame's tilt, roll and height are shared by all its pairs, so the joint system knows
 them. First stage: every correspondence a floor point of its own, thinned, so that a wrong one
 harms nothing else. Then correspondences whose ends do not meet are cut, the rest are joined into
-tracks, and the second stage solves for all of them. numpy and scipy only.
+tracks, and the second stage solves for all of them.
 """
 
 from collections.abc import Mapping, Sequence

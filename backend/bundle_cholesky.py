@@ -1,4 +1,4 @@
-"""Sparse Cholesky over 6x6 blocks with the inverse's diagonal: multifrontal, numpy only per front.
+"""Sparse Cholesky over 6x6 blocks with the inverse's diagonal: multifrontal.
 
 Cost is near-linear where the graph is like a map's. The selected inverse follows the same tree from
 the root down (Takahashi, Fagan, Chin 1973), so covariances cost about as much as one solution.
@@ -8,17 +8,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import get_lapack_funcs
+from scipy.linalg import get_blas_funcs, get_lapack_funcs
 
+from groundfuse.backend.bundle_compiled import add_update, assemble
 from groundfuse.backend.bundle_plan import BLOCK, Front, Integers, scalars
 
 Array = NDArray[np.float64]
 
 # Fronts are small and many: the checks around `cholesky` would cost more than it does.
 POTRF, TRTRS = get_lapack_funcs(("potrf", "trtrs"), dtype=np.float64)
-
-MOST_RUNS = 40
-"""An update in more runs of rows than this is added by index instead."""
+(SYRK,) = get_blas_funcs(("syrk",), dtype=np.float64)
 
 
 class NotPositiveDefiniteError(Exception):
@@ -35,18 +34,6 @@ class Factor:
     num_nodes: int
 
 
-def _add_update(dense: Array, update: Array, child: Front) -> None:
-    """Add a child's update to the lower triangle of its parent's front, in place."""
-    if len(child.runs) > MOST_RUNS:
-        dense[child.place[:, None], child.place] += update
-        return
-    for number, (source, target, rows) in enumerate(child.runs):
-        part = update[source : source + rows]
-        into = dense[target : target + rows]
-        for other, into_other, columns in child.runs[: number + 1]:
-            into[:, into_other : into_other + columns] += part[:, other : other + columns]
-
-
 def factorise(fronts: tuple[Front, ...], blocks: Array, num_nodes: int) -> Factor:
     """Factorise the matrix whose stored blocks (n, 6, 6) follow the plan's rows and columns.
 
@@ -60,12 +47,9 @@ def factorise(fronts: tuple[Front, ...], blocks: Array, num_nodes: int) -> Facto
         m = BLOCK * len(front.own)
         size = m + BLOCK * len(front.later)
         dense = np.zeros((size, size))
-        values = blocks[front.entry]
-        values = np.where(front.flip[:, None, None], values.transpose(0, 2, 1), values)
-        as_blocks = dense.reshape(size // BLOCK, BLOCK, size // BLOCK, BLOCK)
-        as_blocks[front.row, :, front.column, :] += values
+        assemble(blocks, front.entry, (front.row, front.column), front.flip, dense)
         for child, update in zip(children[index], updates[index], strict=True):
-            _add_update(dense, update, fronts[child])
+            add_update(dense, update, fronts[child].place)
         updates[index] = []
         corner, failed = POTRF(dense[:m, :m], lower=1, clean=1)
         if failed:
@@ -74,8 +58,9 @@ def factorise(fronts: tuple[Front, ...], blocks: Array, num_nodes: int) -> Facto
         rows = _lower_solve(corner, dense[m:, :m].T)
         below.append(np.ascontiguousarray(rows.T))
         if front.parent >= 0:
-            update = dense[m:, m:]
-            update -= below[-1] @ rows
+            # The upper triangle of the transpose is the lower one: no copy on the way to BLAS.
+            update = np.ascontiguousarray(dense[m:, m:])
+            SYRK(-1.0, below[-1].T, beta=1.0, c=update.T, trans=1, overwrite_c=1)
             updates[front.parent].append(update)
             children[front.parent].append(index)
     return Factor(fronts, tuple(diagonal), tuple(below), num_nodes)

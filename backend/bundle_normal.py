@@ -1,4 +1,4 @@
-"""Normal equations of the bundle with the floor points eliminated; numpy only.
+"""Normal equations of the bundle with the floor points eliminated.
 
 Nodes are frames (x, y, theta, tilt, roll, height) and, after them, robots (mount offsets of tilt,
 roll, height; focal length; distortion; a spare): 6 unknowns each. Residuals are whitened; with
@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from groundfuse.backend.bundle_compiled import frame_blocks, pair_blocks, right_sums, taken_steps
 from groundfuse.backend.bundle_plan import BLOCK
 from groundfuse.backend.bundle_priors import Pattern, Priors
 from groundfuse.backend.bundle_rows import Rows
@@ -101,10 +102,10 @@ def reduce_rows(seen: Observations, rows: Rows, pattern: Pattern, priors: Priors
     if size == 3:
         by_frame[5, seen.first, 2] += rows.relief[1] * rows.relief[2] / root[2, 2]
         np.add.at(blocks[:, 5, 5], seen.frame[seen.first], rows.relief[2] ** 2)
-    for frame, part in enumerate(frame_parts(seen)):
-        own, out = rows.by_frame[:, part].reshape(BLOCK, -1), by_frame[:, part].reshape(BLOCK, -1)
-        blocks[frame] += own @ own.T - out @ out.T
-    _add_pairs(seen, by_frame, pattern, blocks)
+    frame_blocks(rows.by_frame, by_frame, seen.frame_start, blocks)
+    beside = np.ascontiguousarray(by_frame.transpose(1, 0, 2))
+    pairs = seen.pair_i, seen.pair_j
+    pair_blocks(beside, pairs, seen.pair_start, pattern.pair_at, blocks)
     by_lens = _lens_by_points(seen, lens_rows, priors) if lens_rows.size else None
     reduced = Reduced(rows, basis, by_frame, by_lens, root, blocks)
     if by_lens is not None:
@@ -134,32 +135,16 @@ def right_side(
     if len(reduced.basis) == 3:
         by_points[:, 2] += relief[1] * relief[0] / reduced.root[2, 2]
         np.add.at(right[:, 5], seen.frame[seen.first], relief[2] * relief[0])
-    lens = right[priors.num_frames :, 3:5]
-    for frame, part in enumerate(frame_parts(seen)):
-        own, out = reduced.rows.by_frame[:, part], reduced.by_frame[:, part]
-        right[frame] += own.reshape(BLOCK, -1) @ error[part].ravel()
-        right[frame] -= out.reshape(BLOCK, -1) @ by_points[seen.point[part]].ravel()
-        if reduced.by_lens is not None:
+    rows = reduced.rows.by_frame, reduced.by_frame
+    right_sums(rows, error, seen.point, by_points, seen.frame_start, right)
+    if reduced.by_lens is not None:
+        lens = right[priors.num_frames :, 3:5]
+        for frame, part in enumerate(frame_parts(seen)):
             k = reduced.rows.by_lens[:, part].reshape(2, -1)
             lens[priors.robot_of[frame]] += k @ error[part].ravel()
-    if reduced.by_lens is not None:
         across = reduced.by_lens.reshape(-1, 2 * priors.num_robots)
         lens -= (across.T @ by_points.ravel()).reshape(-1, 2)
     return right, by_points
-
-
-def _add_pairs(seen: Observations, by_frame: Array, pattern: Pattern, blocks: Array) -> None:
-    """Add what frames have in common through the floor points they share."""
-    place, bounds = pattern.pair_at.tolist(), seen.pair_start.tolist()
-    for chunk in seen.pair_parts:
-        start = bounds[chunk.start]
-        inside = slice(start, bounds[chunk.stop])
-        first = -np.take(by_frame, seen.pair_i[inside], axis=1)
-        second = np.take(by_frame, seen.pair_j[inside], axis=1)
-        for index in range(chunk.start, chunk.stop):
-            part = slice(bounds[index] - start, bounds[index + 1] - start)
-            a, b = first[:, part].reshape(BLOCK, -1), second[:, part].reshape(BLOCK, -1)
-            np.matmul(a, b.T, out=blocks[place[index]])
 
 
 def _lens_by_points(seen: Observations, lens_rows: Array, priors: Priors) -> Array:
@@ -201,11 +186,8 @@ def point_steps(
     seen: Observations, reduced: Reduced, explained: Array, step: Array, priors: Priors
 ) -> Array:
     """Steps (points, d) of the floor points that go with a step (frames + robots, 6)."""
-    change = np.empty((len(seen.frame), len(reduced.basis)))
-    for frame, part in enumerate(frame_parts(seen)):
-        rows = reduced.by_frame[:, part].reshape(BLOCK, -1)
-        change[part] = (step[frame] @ rows).reshape(-1, change.shape[1])
-    rest = explained - _by_points(change, seen.point, seen.num_points)
+    rest = explained.copy()
+    taken_steps(reduced.by_frame, step, seen.frame_start, seen.point, rest)
     if reduced.by_lens is not None:
         flat = reduced.by_lens.reshape(*rest.shape, -1)
         rest = rest - flat @ step[priors.num_frames :, 3:5].ravel()

@@ -25,8 +25,6 @@ class Front:
         own: nodes eliminated here, in order.
         later: nodes touched that are eliminated later, in order.
         parent: index of the front that takes the update, -1 at a root.
-        runs: `later` inside the parent's front, as runs of neighbouring rows: (first row of the
-            update, first row of the front, rows).
         place: scalar positions of `later` inside the parent's front.
         entry: indices of the matrix blocks that are assembled here.
         row: block row of each entry inside this front.
@@ -37,7 +35,6 @@ class Front:
     own: Integers
     later: Integers
     parent: int
-    runs: tuple[tuple[int, int, int], ...]
     place: Integers
     entry: Integers
     row: Integers
@@ -140,7 +137,6 @@ def plan(rows: Integers, columns: Integers, num_nodes: int, last: Integers) -> t
                 order[own],
                 order[later] if later else np.zeros(0, dtype=np.int64),
                 parent,
-                _runs(at),
                 scalars(at),
                 entry,
                 np.searchsorted(inside, high[entry]),
@@ -149,16 +145,6 @@ def plan(rows: Integers, columns: Integers, num_nodes: int, last: Integers) -> t
             )
         )
     return tuple(fronts)
-
-
-def _runs(at: Integers) -> tuple[tuple[int, int, int], ...]:
-    """Cut block positions into runs of neighbours: scalar (source, target, length)."""
-    if len(at) == 0:
-        return ()
-    first = np.flatnonzero(np.diff(at, prepend=at[0] - 2) != 1)
-    length = np.diff(first, append=len(at))
-    rows = zip(first.tolist(), at[first].tolist(), length.tolist(), strict=True)
-    return tuple((BLOCK * source, BLOCK * target, BLOCK * count) for source, target, count in rows)
 
 
 def scalars(nodes: Integers) -> Integers:

@@ -86,7 +86,6 @@ class Observations:
         pair_key: (k,) frame_i * frames + frame_j of each pair of frames that share points.
         pair_start: (k + 1,) first pair of each.
         parts: observations in pieces that fit a processor's cache, whole frames each.
-        pair_parts: the same of `pair_key`.
     """
 
     frame: Integers
@@ -102,7 +101,6 @@ class Observations:
     pair_key: Integers
     pair_start: Integers
     parts: tuple[slice, ...]
-    pair_parts: tuple[slice, ...]
 
 
 def mixed_keys(number: Integers, ray: Array) -> Keys:
@@ -209,7 +207,8 @@ def observations(
     pair_i, pair_j = _pairs_within(point)
     key = frame[pair_i] * num_frames + frame[pair_j]
     by_key = np.argsort(key, kind="stable")
-    pair_key, start = np.unique(key[by_key], return_index=True)
+    key = key[by_key]
+    start = np.flatnonzero(np.diff(key, prepend=-1))
     pair_start, frame_start = (
         np.append(start, len(key)),
         np.searchsorted(frame, np.arange(num_frames + 1)),
@@ -228,10 +227,9 @@ def observations(
         frame_start,
         pair_i[by_key],
         pair_j[by_key],
-        pair_key,
+        key[start],
         pair_start,
         tuple(whole),
-        pieces(pair_start),
     )
 
 
