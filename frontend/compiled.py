@@ -11,18 +11,20 @@ from typing import Any, TypeVar
 
 from numba import njit
 
+_njit: Any = njit  # its types know neither all options nor that what it returns can be called alike
+
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def compiled(function: Function) -> Function:
     """Compile a function at its first call; a division by zero gives infinity, as in numpy."""
-    machine: Function = njit(cache=True, nogil=True, error_model="numpy")(function)
+    machine: Function = _njit(cache=True, nogil=True, error_model="numpy")(function)
     return machine
 
 
 def part(function: Function) -> Function:
     """Compile a function that compiled functions call, without a way in from outside."""
-    machine: Function = njit(
+    machine: Function = _njit(
         nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True
     )(function)
     return machine

@@ -11,13 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from groundfuse.backend.measurement import Attitude, Correspondences, Se2
-from groundfuse.backend.reprojection import transfer
+from groundfuse.backend.measurement import Attitude, Correspondences, Se2, wrap_rad
 from groundfuse.frontend.arrays import Floats, Mask
-
-MAD_TO_SIGMA = 1.0 / 1.1774  # median of a Rayleigh-distributed length, in sigmas
-
-CONVERGED = 1e-4  # squared length of a step in sigmas: a hundredth of a sigma
+from groundfuse.frontend.fit_compiled import Asked, Pairs, fit_rows
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,35 +68,6 @@ class PairFit:
     converged: bool
 
 
-def _vector(attitude: Attitude) -> Floats:
-    return np.array([attitude.tilt_rad, attitude.roll_rad, attitude.height_m])
-
-
-@dataclass(slots=True)
-class _State:
-    pose: Se2
-    attitude: Floats  # (6,) a then b
-
-    def moved(self, step: Floats) -> "_State":
-        turn = Se2(float(step[0]), float(step[1]), float(step[2]))
-        return _State(self.pose @ turn, self.attitude + step[3:])
-
-
-def _linearised(points: Correspondences, state: _State) -> tuple[Floats, Floats, Floats]:
-    """Residuals (n, 2), Jacobian (n, 2, 9) and derivative by the ray in a (n, 2, 2)."""
-    got = transfer(points.rays_a, state.attitude[:3], state.pose.vector(), state.attitude[3:])
-    jacobian = np.concatenate([got.by_pose, got.by_attitude_a, got.by_attitude_b], axis=2)
-    return got.rays_b - points.rays_b, jacobian, got.by_rays_a
-
-
-def _whitening(points: Correspondences, by_rays_a: Floats) -> Floats:
-    """Inverse Cholesky factors (n, 2, 2) of the transfer error's covariance."""
-    spread = by_rays_a @ by_rays_a.transpose(0, 2, 1) * (points.sigma_a**2)[:, None, None]
-    spread += np.eye(2) * (points.sigma_b**2)[:, None, None]
-    spread = np.where(np.isfinite(spread), spread, np.eye(2))
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(spread)), dtype=np.float64)
-
-
 def fit_pair(
     points: Correspondences, start: Se2, prior_a: Prior, prior_b: Prior, options: FitOptions
 ) -> PairFit:
@@ -113,87 +80,33 @@ def fit_pair(
         prior_b: attitude of camera b.
         options: see `FitOptions`.
     """
-    mean = np.concatenate([_vector(prior_a.mean), _vector(prior_b.mean)])
-    information = 1.0 / np.concatenate([_vector(prior_a.sigma), _vector(prior_b.sigma)]) ** 2
-    state = _State(start, mean.copy())
-    whitening = _whitening(points, _linearised(points, state)[2])
-    noise = np.inf
-    hessian, step = np.eye(9), np.zeros(9)
-    for _ in range(options.robust_iterations):
-        residual, jacobian = _whitened(points, state, whitening)
-        length = np.linalg.norm(residual, axis=1)
-        noise = min(noise, _noise(length, options))
-        weight = 1.0 / (1.0 + (length / (options.cauchy_sigmas * noise)) ** 2) / noise**2
-        hessian, step = _step(residual, jacobian, weight, information, mean - state.attitude)
-        state = state.moved(step)
-        if step @ hessian @ step < CONVERGED:
-            break
-    # The weights follow the fitted geometry once, then stay.
-    whitening = _whitening(points, _linearised(points, state)[2])
-    residual, _ = _whitened(points, state, whitening)
-    length = np.linalg.norm(residual, axis=1)
-    noise = _noise(length[length < options.gate_sigmas * noise], options)
-    inliers: Mask = length < options.gate_sigmas * noise
-    # Tails are heavier than a Gaussian's: what counts for the covariance is the mean square.
-    noise = max(noise, float(np.sqrt((length[inliers] ** 2).sum() / _freedom(inliers))))
-    weight = inliers / noise**2
-    for _ in range(options.final_iterations):
-        residual, jacobian = _whitened(points, state, whitening)
-        hessian, step = _step(residual, jacobian, weight, information, mean - state.attitude)
-        state = state.moved(step)
-        if step @ hessian @ step < CONVERGED:
-            break
-    pull = state.attitude - mean
-    converged = bool(step @ hessian @ step < CONVERGED)
-    return _result(
-        state, hessian, inliers, noise, float(pull @ (information * pull)), converged=converged
+    mean = np.concatenate([np.zeros(3), _vector(prior_a.mean), _vector(prior_b.mean)])
+    sigma = np.concatenate([_vector(prior_a.sigma), _vector(prior_b.sigma)])
+    information = np.concatenate([np.zeros(3), 1.0 / sigma**2])
+    found = np.concatenate([start.vector(), mean[3:]])
+    inliers = np.zeros(len(points), dtype=np.bool_)
+    asked = Asked(
+        options.robust_iterations,
+        options.final_iterations,
+        options.cauchy_sigmas,
+        options.gate_sigmas,
+        options.min_noise,
     )
-
-
-def _result(
-    state: _State, hessian: Floats, inliers: Mask, noise: float, chi2: float, *, converged: bool
-) -> PairFit:
+    pairs = Pairs(points.rays_a, points.rays_b, points.sigma_a, points.sigma_b)
+    noise, converged, hessian = fit_rows(pairs, asked, mean, information, found, inliers)
     covariance = np.linalg.inv(hessian)[:3, :3]
+    pull = found - mean
     return PairFit(
-        state.pose,
+        Se2(float(found[0]), float(found[1]), wrap_rad(float(found[2]))),
         (covariance + covariance.T) / 2.0,
-        Attitude(*map(float, state.attitude[:3])),
-        Attitude(*map(float, state.attitude[3:])),
+        Attitude(*map(float, found[3:6])),
+        Attitude(*map(float, found[6:])),
         inliers,
         noise,
-        chi2,
+        float(pull @ (information * pull)),
         converged,
     )
 
 
-def _whitened(points: Correspondences, state: _State, whitening: Floats) -> tuple[Floats, Floats]:
-    residual, jacobian, _ = _linearised(points, state)
-    bad = ~np.isfinite(residual).all(axis=1)
-    residual[bad], jacobian[bad] = 1e9, 0.0  # behind a camera: no pull, never an inlier
-    return (whitening @ residual[:, :, None])[:, :, 0], whitening @ jacobian
-
-
-def _noise(length: Floats, options: FitOptions) -> float:
-    """Noise as a multiple of the model, from the median residual length."""
-    median = float(np.median(length)) if len(length) else np.inf
-    return max(options.min_noise, median * MAD_TO_SIGMA)
-
-
-def _freedom(inliers: Mask) -> float:
-    """Residual coordinates less the parameters that they determine, at least one."""
-    return max(1.0, 2.0 * float(inliers.sum()) - 9.0)
-
-
-def _step(
-    residual: Floats, jacobian: Floats, weight: Floats, information: Floats, pull: Floats
-) -> tuple[Floats, Floats]:
-    """Normal equations (9, 9) with the prior, and their Gauss-Newton step."""
-    weighted = jacobian * weight[:, None, None]
-    hessian = np.einsum("nik,nil->kl", weighted, jacobian)
-    gradient = np.einsum("nik,ni->k", weighted, residual)
-    hessian[3:, 3:] += np.diag(information)
-    gradient[3:] -= information * pull
-    # The motion alone can be singular (one point): a prior wider than any floor keeps it solvable.
-    scale = np.trace(hessian[:3, :3]) * 1e-15 + 1e-12
-    hessian[:3, :3] += np.eye(3) * scale
-    return hessian, -np.linalg.solve(hessian, gradient)
+def _vector(attitude: Attitude) -> Floats:
+    return np.array([attitude.tilt_rad, attitude.roll_rad, attitude.height_m])
