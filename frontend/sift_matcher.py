@@ -17,6 +17,7 @@ from groundfuse.frontend.consensus import (
 )
 from groundfuse.frontend.features import Features
 from groundfuse.frontend.matches import Matches, Miss
+from groundfuse.frontend.nearest_compiled import most_similar
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,11 +107,9 @@ def _model(a: Features, b: Features, options: MatchOptions) -> tuple[float, floa
 def candidates(a: Features, b: Features, options: MatchOptions) -> Candidates:
     """Return the nearest features of b for every feature of a."""
     count = min(options.num_neighbours, len(b))
-    distance = _distances(a, b)
-    nearest = np.argpartition(distance, count - 1, axis=1)[:, :count]
-    near = np.take_along_axis(distance, nearest, axis=1)
-    order = np.argsort(near, axis=1, kind="stable")
-    index_b = np.take_along_axis(nearest, order, axis=1).ravel()
+    nearest = np.empty((len(a), count), dtype=np.int64)
+    most_similar(_similarities(a, b), nearest)
+    index_b = nearest.ravel()
     index_a = np.repeat(np.arange(len(a)), count)
     rank = np.tile(np.arange(count), len(a))
     alike = np.abs(a.log_size[index_a] - b.log_size[index_b]) < options.max_log_size
@@ -119,9 +118,10 @@ def candidates(a: Features, b: Features, options: MatchOptions) -> Candidates:
     return Candidates(a.floor_m[index_a], b.floor_m[index_b], index_a, index_b, rank, turn_rad)
 
 
-def _distances(a: Features, b: Features) -> Picture32:
-    """Squared Euclidean or twice the Hamming distances, up to a constant."""
-    return -(_signed(a.descriptors) @ _signed(b.descriptors).T)
+def _similarities(a: Features, b: Features) -> Picture32:
+    """How much less than the largest the Euclidean or Hamming distances are, up to a factor."""
+    similarity: Picture32 = _signed(a.descriptors) @ _signed(b.descriptors).T
+    return similarity
 
 
 def _signed(descriptors: np.ndarray[Any, Any]) -> Picture32:
