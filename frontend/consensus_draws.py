@@ -11,6 +11,9 @@ from groundfuse.frontend.arrays import Floats, Mask
 from groundfuse.frontend.compiled import compiled, part
 from groundfuse.frontend.consensus_table import Limits, Table
 
+PARTS = 8
+"""Parts of the weight per candidate: most begin at the candidate they end at."""
+
 
 @part
 def _apart(motion: Floats, other: Floats, limits: Limits) -> tuple[float, float]:
@@ -53,9 +56,9 @@ def allowed(motion: Floats, limits: Limits) -> bool:
 
 @part
 def _guide(cumulative: Floats) -> np.ndarray:
-    """For each n-th of the weight, the first candidate that reaches it (Chen and Asau 1974)."""
-    count = len(cumulative)
-    guide = np.empty(count, np.int64)
+    """For each part of the weight, the first candidate that reaches it (Chen and Asau 1974)."""
+    count = PARTS * len(cumulative)
+    guide = np.empty(count, np.int32)
     at = 0
     for k in range(count):
         while cumulative[at] < cumulative[-1] * k / count:

@@ -4,6 +4,7 @@ A pair's verdict depends on what was seen of the two, on priors and on options, 
 neither on the frames' numbers nor on when or where it was computed.
 """
 
+import functools
 import hashlib
 import math
 from dataclasses import dataclass, replace
@@ -17,7 +18,7 @@ from groundfuse.frontend.arrays import Image
 from groundfuse.frontend.consensus import Gate
 from groundfuse.frontend.features import Features
 from groundfuse.frontend.fit import Prior
-from groundfuse.frontend.motion import View, relative_pose
+from groundfuse.frontend.motion import MotionOptions, View, relative_pose
 from groundfuse.frontend.photometric import GreyView
 from groundfuse.tools.code_version import code_of
 from groundfuse.tools.frame_look import Looked, looked
@@ -101,11 +102,18 @@ def pair_job(a: Spot, b: Spot, options: FrontEndOptions) -> PairJob:
     gate = odometry_gate(a, b, options)
     widened = None if gate is None else swayed(gate, a, b, options)
     views, looks = (_view(a), _view(b)), (a.key, b.key)
-    code = code_of("groundfuse.tools.pair_verdict")
-    match = options.paper if options.matcher is Matcher.PAPER else options.match
     known = [(view.prior, view.base_from_foot) for view in views]
-    key = key_of("pair", code, looks, known, gate, widened, match, options.motion)
-    return PairJob(*views, gate, widened, looks, key)
+    match = options.paper if options.matcher is Matcher.PAPER else options.match
+    how = _key_of_method(match, options.motion)
+    return PairJob(*views, gate, widened, looks, key_of("pair", how, looks, known, gate, widened))
+
+
+@functools.lru_cache(maxsize=4)
+def _key_of_method(
+    match: sift_matcher.MatchOptions | paper_matcher.PaperOptions, motion: MotionOptions
+) -> bytes:
+    """Return what stands for code and options: the same for all pairs of a run."""
+    return key_of("how", code_of("groundfuse.tools.pair_verdict"), match, motion)
 
 
 def verdict(job: PairJob, a: Looked, b: Looked, options: FrontEndOptions) -> Verdict:
