@@ -13,8 +13,6 @@ JACOBIAN_STEP = 4
 """The scale of the picture is looked at in every fourth cell of every fourth row."""
 OUTSIDE_PX = -1e4
 """Stands for a cell without a place in the picture, which remap cannot take as nan."""
-PADDING_PX = 16
-"""A cell inside the picture reaches out by half its own 16 px at most, and bicubic by two more."""
 MEAN_TO_POINT = np.array([-1.0, 26.0, -1.0], dtype=np.float32) / np.float32(24.0)
 """A pixel is the mean m of the light over its square; the light at its middle is m - m'' / 24 to
 fourth order, along each axis (the finite-volume methods' rule)."""
@@ -57,19 +55,6 @@ def area_plan(source_px: Floats, wanted: Mask) -> AreaPlan:
     inner = np.asarray(fine, dtype=np.float32)[samples:-samples, samples:-samples]
     map_u, map_v = (np.ascontiguousarray(inner[..., axis]) for axis in (0, 1))
     return AreaPlan(level, samples, map_u, map_v)
-
-
-def area_remap(pyramid: list[Image], source_px: Floats, wanted: Mask) -> Image:
-    """Plan and read at once, bicubic throughout; see `area_plan` and `area_read`."""
-    plan = area_plan(source_px, wanted)
-    # Cells far outside cost as much as others unless the border is constant; what cells at the
-    # edge read beyond it is in the padding.
-    picture = _level(pyramid, plan)
-    pad = PADDING_PX
-    padded = cv2.copyMakeBorder(picture, pad, pad, pad, pad, cv2.BORDER_REPLICATE)
-    map_u, map_v = plan.map_u + np.float32(PADDING_PX), plan.map_v + np.float32(PADDING_PX)
-    sampled = cv2.remap(padded, map_u, map_v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
-    return _cell_means(np.asarray(sampled, dtype=picture.dtype), plan)
 
 
 def point_values(image: Image) -> Image:

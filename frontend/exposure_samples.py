@@ -5,11 +5,11 @@ import math
 import cv2
 import numpy as np
 
-from groundfuse.frontend.area_remap import area_remap
-from groundfuse.frontend.arrays import Floats, Image
+from groundfuse.frontend.arrays import Floats
 from groundfuse.frontend.gains import Samples, radius_squared
 from groundfuse.frontend.mosaic_plan import MosaicPlan
-from groundfuse.frontend.sight import Grid, Sight, sight
+from groundfuse.frontend.pyramid import Pyramid
+from groundfuse.frontend.sight import Grid, read_window, sight
 
 CELLS_PER_VIEW = 1200
 DARKEST = 4.0
@@ -28,43 +28,46 @@ def sampling_grid(plan: MosaicPlan) -> Grid:
     return Grid(fine.x_min_m, fine.y_max_m, fine.m_per_px * side, rows, columns)
 
 
-def sample_exposure(plan: MosaicPlan, number: int, pyramid: list[Image]) -> Samples:
+def sample_exposure(plan: MosaicPlan, grid: Grid, number: int, pyramid: Pyramid) -> Samples:
     """Sample one view.
 
     Args:
         plan: of the mosaic.
+        grid: see `sampling_grid`.
         number: of the view's extent in the plan.
         pyramid: the view's picture and its halvings.
     """
-    grid, block = sampling_grid(plan), plan.extents[number]
+    block = plan.extents[number]
     view = plan.views[block.view]
     side = round(grid.m_per_px / plan.grid.m_per_px)
     rows = slice(block.rows.start // side, math.ceil(block.rows.stop / side))
     columns = slice(block.columns.start // side, math.ceil(block.columns.stop / side))
     limit = plan.limit_m[block.view] / grid.m_per_px
-    part = grid.part(rows, columns)
-    seen = sight(view.camera, view.attitude, view.team_from_foot, part, limit)
-    colour = area_remap(pyramid, seen.source_px, seen.seen)
-    kept = seen.seen & (colour.min(axis=2) >= DARKEST) & (colour.max(axis=2) <= BRIGHTEST)
-    row, column = np.nonzero(kept)
+    place = view.camera, view.attitude, view.team_from_foot
+    found = sight(*place, grid, limit, (rows, columns))
+    seen = read_window(found, lambda: pyramid, rows, columns)
+    kept = (seen.colour.min(axis=1) >= DARKEST) & (seen.colour.max(axis=1) <= BRIGHTEST)
+    row, column = seen.cell[kept].astype(np.int64).T
+    px = seen.place[kept, :2].astype(np.float64)
+    px_per_cell = 1.0 / (seen.place[kept, 2] * side)
     return Samples(
         cell=(row + rows.start) * grid.columns + column + columns.start,
         view=np.full(len(row), block.view),
-        radius2=radius_squared(view.camera.intrinsics, seen.source_px[1:-1, 1:-1][kept]),
-        colour=colour[kept].astype(np.float64),
-        point=_points(pyramid, seen, side, kept),
+        radius2=radius_squared(view.camera.intrinsics, px),
+        colour=seen.colour[kept].astype(np.float64),
+        point=_points(pyramid, px, px_per_cell),
     )
 
 
-def _points(pyramid: list[Image], seen: Sight, side: int, kept: np.ndarray) -> Floats:
+def _points(pyramid: Pyramid, px: Floats, px_per_cell: Floats) -> Floats:
     """Colours (n, 3) at the cells' centres, about as fine as the mosaic's own cells."""
-    if not kept.any():
+    if not len(px):
         return np.zeros((0, 3))
-    px_per_cell = 1.0 / (float(np.median(seen.footprint_cells[kept])) * side)
-    level = min(math.floor(math.log2(max(px_per_cell, 1.0))), len(pyramid) - 1)
-    map_u, map_v = (seen.source_px[1:-1, 1:-1][kept] / 2.0**level).astype(np.float32).T
-    read = cv2.remap(pyramid[level], map_u[None], map_v[None], cv2.INTER_LINEAR)
-    points: Floats = np.asarray(read, dtype=np.float64)[0]
+    finest = math.floor(math.log2(max(float(np.median(px_per_cell)), 1.0)))
+    level = min(finest, len(pyramid.table) - 1)
+    map_u, map_v = (px / 2.0**level).astype(np.float32).T
+    read = cv2.remap(pyramid.level(level), map_u[None], map_v[None], cv2.INTER_LINEAR)
+    points: Floats = np.asarray(read, dtype=np.float64)[0, :, :3]
     return points
 
 

@@ -6,6 +6,7 @@ diagonals. A gamma curve keeps the model: powers of products are products of pow
 own colours are eliminated cell by cell; what stands on the floor is outvoted (Cauchy weights).
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,13 +67,6 @@ class Exposure:
     falloff: Floats
     noise_levels: float
 
-    def log_factor(self, view: int, radius2: Floats) -> Floats:
-        """Return the logarithm (..., 3) of what a picture's values are to be divided by."""
-        c1, c2, c3 = self.falloff[view]
-        fall = radius2 * (c1 + radius2 * (c2 + radius2 * c3))
-        total: Floats = fall[..., None] + self.log_gain[view]
-        return total
-
 
 def neutral_exposure(num_views: int) -> Exposure:
     """Return the exposure that changes nothing."""
@@ -83,9 +77,13 @@ def neutral_exposure(num_views: int) -> Exposure:
 def radius_squared(lens: Intrinsics, px: Floats) -> Floats:
     """Return squared distances (...) of pixels (..., 2) from the centre, half diagonals."""
     offset = px - np.array([lens.cx_px, lens.cy_px])
-    half = np.hypot(lens.width_px, lens.height_px) / 2.0
-    squared: Floats = (offset[..., 0] ** 2 + offset[..., 1] ** 2) / half**2
+    squared: Floats = (offset[..., 0] ** 2 + offset[..., 1] ** 2) / half_diagonal_px(lens) ** 2
     return squared
+
+
+def half_diagonal_px(lens: Intrinsics) -> float:
+    """Return half the length of a picture's diagonal."""
+    return math.hypot(lens.width_px, lens.height_px) / 2.0
 
 
 def estimate_exposure(samples: Samples, lens_of_view: Numbers) -> Exposure:

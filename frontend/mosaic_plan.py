@@ -12,6 +12,7 @@ from groundfuse.backend.measurement import Attitude, FrameId, Se2
 from groundfuse.frontend.arrays import Image
 from groundfuse.frontend.camera import Camera
 from groundfuse.frontend.footprint import Footprint, footprint
+from groundfuse.frontend.selection_compiled import DEEPEST
 from groundfuse.frontend.sight import Grid
 
 
@@ -97,12 +98,14 @@ class MosaicPlan:
         views: in the order of their frames, whatever order they were given in.
         grid: of the mosaic.
         limit_m: (views,) longest useful footprint of a pixel.
+        finest_m: (views,) shortest footprint of a pixel; inf where a view shows no floor.
         extents: of the views that show any useful floor.
     """
 
     views: tuple[MosaicView, ...]
     grid: Grid
     limit_m: tuple[float, ...]
+    finest_m: tuple[float, ...]
     extents: tuple[Extent, ...]
 
 
@@ -135,7 +138,8 @@ def plan_mosaic(views: Sequence[MosaicView], options: MosaicOptions) -> MosaicPl
             f"{options.max_cells}: raise m_per_px"
         )
     extents = tuple(extent(grid, i, box) for i, box in boxes.items())
-    return MosaicPlan(ordered, grid, limit_m, extents)
+    finest_m = tuple(shown.finest_m_per_px(0.0) for shown in prints)
+    return MosaicPlan(ordered, grid, limit_m, finest_m, extents)
 
 
 def _check(views: Sequence[MosaicView], options: MosaicOptions) -> None:
@@ -146,8 +150,8 @@ def _check(views: Sequence[MosaicView], options: MosaicOptions) -> None:
             raise ValueError(f"a mosaic takes every frame once, got {a.frame} twice")
     if options.m_per_px is not None and not options.m_per_px > 0.0:
         raise ValueError(f"m_per_px must be positive, got {options.m_per_px:g}")
-    if options.max_depth < 1:
-        raise ValueError(f"max_depth must be at least 1, got {options.max_depth}")
+    if not 1 <= options.max_depth <= DEEPEST:
+        raise ValueError(f"max_depth must be 1 to {DEEPEST}, got {options.max_depth}")
 
 
 def _useful_m(views: Sequence[MosaicView], prints: Sequence[Footprint]) -> dict[str, float]:

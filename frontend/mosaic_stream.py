@@ -8,20 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from groundfuse.frontend.ahead import in_order
-from groundfuse.frontend.area_remap import area_remap
-from groundfuse.frontend.arrays import Image
-from groundfuse.frontend.exposure_samples import merged, sample_exposure
-from groundfuse.frontend.gains import (
-    Exposure,
-    Samples,
-    estimate_exposure,
-    neutral_exposure,
-    radius_squared,
-)
-from groundfuse.frontend.mosaic_plan import Extent, MosaicOptions, MosaicPlan, MosaicView
-from groundfuse.frontend.mosaic_tile import Tile, TileStack, border_weight, sharpness_weight
-from groundfuse.frontend.picture_cache import PictureCache
-from groundfuse.frontend.sight import sight
+from groundfuse.frontend.exposure_samples import merged, sample_exposure, sampling_grid
+from groundfuse.frontend.gains import Exposure, Samples, estimate_exposure, neutral_exposure
+from groundfuse.frontend.mosaic_plan import Extent, MosaicOptions, MosaicPlan
+from groundfuse.frontend.mosaic_tile import Tile, TileStack
+from groundfuse.frontend.picture_cache import Cache
+from groundfuse.frontend.pyramid import Pyramid, halvings, pyramid
+from groundfuse.frontend.sight import Room, read_window, room_for, sight
 
 AHEAD_PER_WORKER = 3
 """Tiles being made or waiting to be taken, for each thread."""
@@ -37,7 +30,7 @@ class _Scene:
     """What every tile needs."""
 
     plan: MosaicPlan
-    pictures: PictureCache
+    pictures: Cache[Pyramid]
     exposure: Exposure
     options: MosaicOptions
 
@@ -65,14 +58,18 @@ def mosaic_tiles(
     Raises:
         ValueError: a picture of another size than its camera's.
     """
-    pictures = PictureCache([_checked_load(view) for view in plan.views], options.cache_bytes)
+
+    def picture(number: int) -> Pyramid:
+        return _picture(plan, number, plan.grid.m_per_px)
+
+    pictures = Cache(picture, options.cache_bytes)
     blocks = _blocks(plan, options.tile_cells)
     samplings = len(plan.extents) if options.compensate else 0
     told = _Steps(progress, samplings + len(blocks))
     exposure = neutral_exposure(len(plan.views))
     with ThreadPoolExecutor(options.workers) as threads:
         if options.compensate:
-            exposure = _exposure(plan, pictures, threads, told)
+            exposure = _exposure(plan, threads, told)
         scene = _Scene(plan, pictures, exposure, options)
 
         def work(item: tuple[Block, list[Extent]]) -> Tile | None:
@@ -85,20 +82,21 @@ def mosaic_tiles(
                 yield block, tile
 
 
-def _checked_load(view: MosaicView) -> Callable[[], Image]:
-    """Return what loads a view's picture and refuses one of another size than its camera's."""
+def _picture(plan: MosaicPlan, number: int, cell_m: float) -> Pyramid:
+    """Load a view's picture, with the halvings that cells of this side are read from.
 
-    def load() -> Image:
-        image = view.load()
-        lens = view.camera.intrinsics
-        if image.shape[:2] != (lens.height_px, lens.width_px):
-            raise ValueError(
-                f"picture {view.frame} is {image.shape[1]} x {image.shape[0]} px, "
-                f"its camera's are {lens.width_px} x {lens.height_px}"
-            )
-        return image
-
-    return load
+    Raises:
+        ValueError: it is of another size than its camera's.
+    """
+    view = plan.views[number]
+    image = view.load()
+    lens = view.camera.intrinsics
+    if image.shape[:2] != (lens.height_px, lens.width_px):
+        raise ValueError(
+            f"picture {view.frame} is {image.shape[1]} x {image.shape[0]} px, "
+            f"its camera's are {lens.width_px} x {lens.height_px}"
+        )
+    return pyramid(image, halvings(cell_m / plan.finest_m[number]))
 
 
 def _blocks(plan: MosaicPlan, side: int) -> list[tuple[Block, list[Extent]]]:
@@ -125,11 +123,12 @@ def _blocks(plan: MosaicPlan, side: int) -> list[tuple[Block, list[Extent]]]:
     ]
 
 
-def _exposure(
-    plan: MosaicPlan, pictures: PictureCache, threads: ThreadPoolExecutor, told: _Steps
-) -> Exposure:
+def _exposure(plan: MosaicPlan, threads: ThreadPoolExecutor, told: _Steps) -> Exposure:
+    grid = sampling_grid(plan)
+
     def work(number: int) -> Samples:
-        return sample_exposure(plan, number, pictures.pyramid(plan.extents[number].view))
+        picture = _picture(plan, plan.extents[number].view, grid.m_per_px)
+        return sample_exposure(plan, grid, number, picture)
 
     parts: list[Samples] = []
     for part in threads.map(work, range(len(plan.extents))):
@@ -144,28 +143,26 @@ def _tile(scene: _Scene, block: Block, shown: list[Extent]) -> Tile | None:
     """Combine all views of one tile, or return None where no view sees any of it."""
     rows, columns = block[0].stop - block[0].start, block[1].stop - block[1].start
     stack = TileStack(rows, columns, min(scene.options.max_depth, len(shown)))
-    seen = [_add_view(stack, scene, block, extent) for extent in shown]
+    room = room_for(rows * columns)
+    seen = [_add_view(stack, scene, block, extent, room) for extent in shown]
     if not any(seen):
         return None
     return stack.finished(scene.exposure.noise_levels, scene.options.num_sigmas)
 
 
-def _add_view(stack: TileStack, scene: _Scene, block: Block, extent: Extent) -> bool:
-    """Warp what one view shows of a tile, compensate it, put it on the stack; False for none."""
+def _add_view(stack: TileStack, scene: _Scene, block: Block, extent: Extent, room: Room) -> bool:
+    """Read what one view shows of a tile and put it on the stack; False for none."""
     part = extent.within(*block)
     if part is None:
         return False
-    plan, view = scene.plan, scene.plan.views[extent.view]
+    plan, view, exposure = scene.plan, scene.plan.views[extent.view], scene.exposure
     limit_cells = plan.limit_m[extent.view] / plan.grid.m_per_px
-    grid = plan.grid.part(*part)
-    found = sight(view.camera, view.attitude, view.team_from_foot, grid, limit_cells)
-    if not found.seen.any():
+    place = view.camera, view.attitude, view.team_from_foot
+    falloff = exposure.falloff[extent.view]
+    found = sight(*place, plan.grid, limit_cells, part, falloff)
+    seen = read_window(found, lambda: scene.pictures.get(extent.view), *part, room)
+    if not len(seen.cell):
         return False
-    warped = area_remap(scene.pictures.pyramid(extent.view), found.source_px, found.seen)
-    radius2 = radius_squared(view.camera.intrinsics, found.lattice_px)
-    factor = found.spread(np.exp(-scene.exposure.log_factor(extent.view, radius2)))
-    fade = found.spread(border_weight(found.lattice_px, view.camera))
-    weight = np.asarray(fade * sharpness_weight(found.footprint_cells), dtype=np.float32)
     offset = part[0].start - block[0].start, part[1].start - block[1].start
-    stack.add(offset, found.seen, warped * factor, found.footprint_cells, weight)
+    stack.add(offset, seen, found.limits, exposure.log_gain[extent.view])
     return True

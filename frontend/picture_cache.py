@@ -1,53 +1,65 @@
-"""Pictures loaded when they are needed and forgotten when others need the room."""
+"""What is made when it is needed and forgotten when others need the room."""
 
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
-
-import cv2
-import numpy as np
-
-from groundfuse.frontend.area_remap import point_values
-from groundfuse.frontend.arrays import Image
-
-SMALLEST_PX = 32
+from concurrent.futures import Future
+from typing import Generic, Protocol, TypeVar
 
 
-class PictureCache:
-    """The most recently used pictures with their halvings, within a budget; safe with threads."""
+class Sized(Protocol):
+    """Something that knows how much memory it takes."""
 
-    def __init__(self, loads: list[Callable[[], Image]], budget_bytes: int) -> None:
-        """Take what loads each picture; nothing is loaded yet."""
-        self._loads = loads
+    @property
+    def nbytes(self) -> int:
+        """Memory held."""
+        ...
+
+
+Thing = TypeVar("Thing", bound=Sized)
+
+
+class Cache(Generic[Thing]):
+    """The most recently used things, within a budget; safe with threads.
+
+    A thing that two threads ask for at once is made once.
+    """
+
+    def __init__(self, make: Callable[[int], Thing], budget_bytes: int) -> None:
+        """Take what makes each thing from its number; nothing is made yet."""
+        self._make = make
         self._budget_bytes = budget_bytes
-        self._held: OrderedDict[int, tuple[Image, ...]] = OrderedDict()
+        self._held: OrderedDict[int, Future[Thing]] = OrderedDict()
+        self._bytes = 0
         self._lock = threading.Lock()
 
-    def pyramid(self, index: int) -> list[Image]:
-        """Return a picture (BGR point values) and its halvings, in a list of the caller's own."""
+    def get(self, number: int) -> Thing:
+        """Return a thing, made now if it isn't held; what its making raises comes through."""
+        mine: Future[Thing] = Future()
         with self._lock:
-            if index in self._held:
-                self._held.move_to_end(index)
-                return list(self._held[index])
-        levels = _pyramid(self._loads[index]())
+            found = self._held.setdefault(number, mine)
+            self._held.move_to_end(number)
+        return self._made(number, mine) if found is mine else found.result()
+
+    def _made(self, number: int, future: "Future[Thing]") -> Thing:
+        try:
+            thing = self._make(number)
+        except BaseException as error:
+            with self._lock:
+                del self._held[number]
+            future.set_exception(error)
+            raise
+        future.set_result(thing)
         with self._lock:
-            self._held[index] = levels
-            while len(self._held) > 1 and self._bytes() > self._budget_bytes:
-                self._held.popitem(last=False)
-        return list(levels)
+            self._bytes += thing.nbytes
+            self._forget()
+        return thing
 
-    def _bytes(self) -> int:
-        return sum(level.nbytes for levels in self._held.values() for level in levels)
-
-
-def _pyramid(image: Image) -> tuple[Image, ...]:
-    """A colour picture's point values and its halvings.
-
-    Halving a pixel's coordinates gives its place in each.
-    """
-    if image.ndim == 2:
-        image = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
-    levels = [point_values(image)]
-    while min(levels[-1].shape[:2]) > SMALLEST_PX:
-        levels.append(np.asarray(cv2.pyrDown(levels[-1]), dtype=np.uint8))
-    return tuple(levels)
+    def _forget(self) -> None:
+        """Let the longest unused go, but not the last of all nor what is still being made."""
+        for number, future in list(self._held.items()):
+            if self._bytes <= self._budget_bytes or len(self._held) == 1:
+                return
+            if future.done():
+                del self._held[number]
+                self._bytes -= future.result().nbytes

@@ -15,6 +15,8 @@ from groundfuse.frontend.arrays import Mask, Picture32
 LEVEL = 2.0
 """Colours are whole numbers of half levels: sums are exact, so that equal deviations are equal
 on every machine and the tie rule decides, not rounding."""
+BITS = 10
+"""Of a colour's half levels: blue, green and red fit into one word, blue lowest."""
 FEWEST_VIEWS = 3
 """With fewer views no majority shows the floor."""
 SURVIVING_SPREAD = 4.0

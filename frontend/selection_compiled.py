@@ -1,18 +1,13 @@
-"""`selection.combined`, compiled: the same rule for a few cells at once, in the processor's cache.
-
-Needs numba; whoever imports this where it is missing gets an ImportError. The machine code is kept
-beside this file (or in the user's cache), so only the first run ever waits for the compiler.
-"""
+"""`selection.combined`, compiled: the same rule, a few cells at once in the processor's cache."""
 
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from groundfuse.frontend.arrays import Picture32
-from groundfuse.frontend.selection import FEWEST_VIEWS, SURVIVING_SPREAD
-from groundfuse.frontend.selection import combined as plainly_combined
+from groundfuse.frontend.compiled import compiled
+from groundfuse.frontend.selection import BITS, FEWEST_VIEWS, SURVIVING_SPREAD
 
 LANES = 128
 """Cells worked on at once: the compiler turns loops over them into vector instructions."""
@@ -20,56 +15,12 @@ LANES = 128
 GONE = -7_000_000
 """Below -2 c S / n of any colours c and mean S / n: they are 1022 half levels at most."""
 DEEPEST = 128
-"""So many views at most keep all sums below 2**31; with more, numpy does it."""
+"""So many views at most keep all sums below 2**31."""
 NOTHING = -(2**31)
+LARGEST = 2**BITS - 1
 
 
-def combined(
-    colours: NDArray[Any],
-    footprint: Picture32,
-    weight: Picture32,
-    noise: float,
-    num_sigmas: float,
-) -> Picture32:
-    """Return what `selection.combined` does, up to rounding; colours of any whole-number type."""
-    if len(colours) > DEEPEST:
-        return plainly_combined(colours, footprint, weight, noise, num_sigmas)
-    floor: Picture32 = np.empty(colours.shape[1:], dtype=np.float32)
-    _combine(colours, footprint, weight, np.float32(noise**2), np.float32(num_sigmas**2), floor)
-    return floor
-
-
-def _combine_cells(
-    colours: Any,  # noqa: ANN401 - arrays, typed by numba when it compiles
-    footprint: Any,  # noqa: ANN401
-    weight: Any,  # noqa: ANN401
-    noise2: Any,  # noqa: ANN401
-    sigmas2: Any,  # noqa: ANN401
-    floor: Any,  # noqa: ANN401
-) -> None:
-    num_views, _, num_cells = colours.shape
-    c = np.zeros((num_views, 3, LANES), np.int32)
-    size = np.zeros((num_views, LANES), np.float32)
-    alive = np.ones((num_views, LANES), np.int32)
-    total = np.zeros((3, LANES), np.int32)
-    for start in range(0, num_cells, LANES):
-        lanes = min(LANES, num_cells - start)
-        total[:] = 0
-        alive[:] = 1
-        for k in range(num_views):
-            for channel in range(3):
-                for i in range(lanes):
-                    value = np.int32(colours[k, channel, start + i])
-                    c[k, channel, i] = value
-                    total[channel, i] += value
-            for i in range(lanes):
-                size[k, i] = footprint[k, start + i]
-        if num_views >= FEWEST_VIEWS:
-            _discard_half(c, size, alive, total)
-            _admit(c, alive, total, noise2, sigmas2)
-        _average(c, alive, weight, floor, start, lanes)
-
-
+@compiled
 def _discard_half(c: Any, size: Any, alive: Any, total: Any) -> None:  # noqa: ANN401
     """The paper's rule; see `selection.discard_half`. All are whole numbers below 2**31.
 
@@ -104,6 +55,7 @@ def _discard_half(c: Any, size: Any, alive: Any, total: Any) -> None:  # noqa: A
                 total[channel, i] -= c[k, channel, i]
 
 
+@compiled
 def _admit(c: Any, alive: Any, total: Any, noise2: Any, sigmas2: Any) -> None:  # noqa: ANN401
     """Mark the views that agree with the surviving half; see `selection.agreeing_views`."""
     num_views = len(c)
@@ -126,26 +78,78 @@ def _admit(c: Any, alive: Any, total: Any, noise2: Any, sigmas2: Any) -> None:  
             alive[k, i] = 1 if squared[k, i] <= limit else alive[k, i]
 
 
-def _average(c: Any, alive: Any, weight: Any, floor: Any, start: int, lanes: int) -> None:  # noqa: ANN401
+@compiled
+def _average(c: Any, alive: Any, share: Any, floor: Any, cells: Any) -> None:  # noqa: ANN401
     """Write the weighted means of the marked views."""
-    used = np.zeros((len(c), LANES), np.float32)
-    total = np.zeros(LANES, np.float32)
+    total = np.zeros((4, LANES), np.float32)
     for k in range(len(c)):
-        for i in range(lanes):
-            used[k, i] = weight[k, start + i] * np.float32(alive[k, i])
-            total[i] += used[k, i]
+        for i in range(LANES):
+            used = share[k, i] * np.float32(alive[k, i])
+            total[3, i] += used
+            for channel in range(3):
+                total[channel, i] += np.float32(c[k, channel, i]) * used
     for channel in range(3):
-        for i in range(lanes):
-            floor[channel, start + i] = 0.0
-        for k in range(len(c)):
-            for i in range(lanes):
-                floor[channel, start + i] += np.float32(c[k, channel, i]) * used[k, i]
-        for i in range(lanes):
-            floor[channel, start + i] /= total[i]
+        for i in range(len(cells)):
+            floor[channel, cells[i]] = total[channel, i] / total[3, i]
 
 
-_compiled: Any = njit(cache=True, nogil=True, error_model="numpy")
-_discard_half = _compiled(_discard_half)
-_admit = _compiled(_admit)
-_average = _compiled(_average)
-_combine: Any = _compiled(_combine_cells)
+@compiled
+def combine_cells(
+    words: Any,  # noqa: ANN401 - arrays, typed when compiled
+    footprint: Any,  # noqa: ANN401
+    weight: Any,  # noqa: ANN401
+    cells: Any,  # noqa: ANN401
+    limits: tuple[Any, Any],
+    floor: Any,  # noqa: ANN401
+) -> None:
+    """Fill the floor's colours; see `selection.combined`.
+
+    Args:
+        words: (n, all cells) colours; see `selection.BITS`.
+        footprint: (all cells, n) for the tie rule.
+        weight: (n, all cells) positive.
+        cells: (m,) those to fill.
+        limits: variance of one view in half levels, and the square of the number of sigmas.
+        floor: (3, all cells) half levels.
+    """
+    num_views = len(words)
+    c = np.zeros((num_views, 3, LANES), np.int32)
+    size = np.zeros((num_views, LANES), np.float32)
+    share = np.zeros((num_views, LANES), np.float32)
+    alive = np.ones((num_views, LANES), np.int32)
+    total = np.zeros((3, LANES), np.int32)
+    for start in range(0, len(cells), LANES):
+        some = cells[start : start + LANES]
+        total[:] = 0
+        alive[:] = 1
+        for k in range(num_views):
+            for i in range(len(some)):
+                word = np.int32(words[k, some[i]])
+                size[k, i], share[k, i] = footprint[some[i], k], weight[k, some[i]]
+                c[k, 0, i] = word & LARGEST
+                c[k, 1, i] = (word >> BITS) & LARGEST
+                c[k, 2, i] = word >> (2 * BITS)
+            for channel in range(3):
+                for i in range(LANES):
+                    total[channel, i] += c[k, channel, i]
+        if num_views >= FEWEST_VIEWS:
+            _discard_half(c, size, alive, total)
+            _admit(c, alive, total, limits[0], limits[1])
+        _average(c, alive, share, floor, some)
+
+
+def combined(
+    colours: NDArray[Any],
+    footprint: Picture32,
+    weight: Picture32,
+    noise: float,
+    num_sigmas: float,
+) -> Picture32:
+    """Return what `selection.combined` does, up to rounding; colours of any whole-number type."""
+    blue, green, red = (colours[:, channel].astype(np.uint32) for channel in range(3))
+    words = blue | green << np.uint32(BITS) | red << np.uint32(2 * BITS)
+    floor: Picture32 = np.empty(colours.shape[1:], dtype=np.float32)
+    cells, sizes = np.arange(floor.shape[1]), np.ascontiguousarray(footprint.T)
+    limits = np.float32(noise**2), np.float32(num_sigmas**2)
+    combine_cells(words, sizes, weight, cells, limits, floor)
+    return floor

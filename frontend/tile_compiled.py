@@ -1,72 +1,151 @@
-"""Putting one view on a tile's stack, compiled; needs numba, else `TileStack.add` uses numpy."""
+"""The loops of `TileStack`, compiled: putting a view's cells on the stack, and taking it down."""
 
 from typing import Any
 
 import numpy as np
-from numba import njit
 
-from groundfuse.frontend.selection import LEVEL
+from groundfuse.frontend.compiled import compiled
+from groundfuse.frontend.selection import BITS, LEVEL
+
+HIGHEST = 511.0
+"""Levels; brighter ones (after division by a small gain) are cut, so that squares stay exact."""
+BORDER_SHARE = 0.08
+"""A view fades in over this share of the picture's shorter side."""
+SMALLEST_WEIGHT = 0.02
+FINE_CELLS = 0.5
+"""A footprint this long, in cells, blurs a cell hardly more than a shorter one."""
 
 
-def _slot(held_footprint: Any, cell: int) -> int:  # noqa: ANN401
+@compiled
+def border_weight(u: Any, v: Any, limits: Any) -> Any:  # noqa: ANN401
+    """Return the weight of a pixel: it fades towards the picture's border.
+
+    No seam shows where a view ends.
+
+    Args:
+        u: column.
+        v: row.
+        limits: last column, first and last row of the used picture.
+    """
+    inside = min(u, limits[0] - u, v - limits[1], limits[2] - v)
+    shorter = min(limits[0], limits[2] - limits[1]) + np.float32(1.0)
+    ramp = max(np.float32(BORDER_SHARE) * shorter, np.float32(1.0))
+    return min(max(inside / ramp, np.float32(SMALLEST_WEIGHT)), np.float32(1.0))
+
+
+@compiled
+def sharpness_weight(footprint_cells: Any) -> Any:  # noqa: ANN401
+    """Return the weight of a view from the footprint of its pixel, in cells.
+
+    The fourth power of the footprint: a view twice as coarse as another hardly blurs what the
+    finer one shows, while views alike are averaged against noise. Among views that are all finer
+    than the cell the footprint matters little.
+    """
+    blur = footprint_cells * footprint_cells + np.float32(FINE_CELLS * FINE_CELLS)
+    return np.float32(1.0) / (blur * blur)
+
+
+@compiled
+def _word(colour: Any, factor: Any, gain: Any) -> Any:  # noqa: ANN401
+    """Return a compensated colour as half levels, three in a word."""
+    word = np.uint32(0)
+    for channel in range(3):
+        level = min(colour[channel] * factor * gain[channel], np.float32(HIGHEST))
+        half = np.uint32(np.rint(level * np.float32(LEVEL)))
+        word |= half << np.uint32(BITS * channel)
+    return word
+
+
+@compiled
+def _coarsest(footprint: Any, cell: int) -> int:  # noqa: ANN401
     """Return the first of a cell's views with the largest footprint."""
-    slot = 0
-    for k in range(1, len(held_footprint)):
-        if held_footprint[k, cell] > held_footprint[slot, cell]:
-            slot = k
+    slot, largest = 0, footprint[cell, 0]
+    for k in range(1, footprint.shape[1]):
+        if footprint[cell, k] > largest:
+            slot, largest = k, footprint[cell, k]
     return slot
 
 
-_coarsest: Any = njit(cache=True, nogil=True)(_slot)
+@compiled
+def _leave_out(word: Any, cell: int, left_out: Any) -> None:  # noqa: ANN401
+    for channel in range(3):
+        half = (word >> np.uint32(BITS * channel)) & np.uint32((1 << BITS) - 1)
+        left_out[channel, cell] += np.float32(half)
 
 
-def _put(
-    offset: tuple[int, int],
-    window: tuple[Any, Any, Any, Any],
+@compiled
+def put(
+    seen: tuple[Any, Any, Any],
+    origin: tuple[int, int, int],
+    gain: Any,  # noqa: ANN401
+    limits: Any,  # noqa: ANN401
     stack: tuple[Any, Any, Any],
-    tallies: tuple[Any, Any, Any],
-    shape: tuple[int, int],
-    highest: float,
+    tallies: tuple[Any, Any, Any, Any],
 ) -> None:
-    """Do what `TileStack.add` does, cell by cell.
+    """Put one view on the stack; of more than it has room for, the finest stay.
 
     Args:
-        offset: row and column of the window's first cell.
-        window: seen, colours, footprint and weight of the view.
-        stack: colours, footprint and weight of the views held.
-        tallies: views held, views seen, and the colours left out.
-        shape: of the tile.
-        highest: level at which colours are cut.
+        seen: cells, places and colours; see `SeenCells`.
+        origin: row and column of the window in the tile, and the tile's columns.
+        gain: (3,) what the view's colours are multiplied by, besides the falloff's factor.
+        limits: see `border_weight`.
+        stack: of the views held: colours (depth, cells) as words, footprints (cells, depth), which
+            are searched cell by cell, and weights (depth, cells).
+        tallies: views held, views seen, the coarsest of a full stack (cells,), and the sums
+            (3, cells) of the colours left out.
     """
-    seen, colours, footprint, weight = window
-    held_colours, held_footprint, held_weight = stack
-    held, count, left_out = tallies
-    depth = len(held_footprint)
-    level, cut = np.float32(LEVEL), np.float32(highest)
-    new = np.zeros(3, np.uint16)
-    for row in range(seen.shape[0]):
-        for column in range(seen.shape[1]):
-            if not seen[row, column]:
+    cells, places, colours = seen
+    words, footprint, weight = stack
+    held, count, coarsest, left_out = tallies
+    depth = len(words)
+    for k in range(len(cells)):
+        cell = (cells[k, 0] + origin[0]) * origin[2] + cells[k, 1] + origin[1]
+        word, size = _word(colours[k], places[k, 3], gain), places[k, 2]
+        count[cell] += 1
+        slot = np.int64(held[cell])
+        if slot < depth:
+            held[cell] += 1
+        else:
+            slot = np.int64(coarsest[cell])
+            if not size < footprint[cell, slot]:
+                _leave_out(word, cell, left_out)
                 continue
-            cell = (row + offset[0]) * shape[1] + column + offset[1]
-            for channel in range(3):
-                new[channel] = np.uint16(np.rint(min(colours[row, column, channel], cut) * level))
-            count[cell] += 1
-            slot = held[cell]
-            if slot < depth:
-                held[cell] += 1
-            else:
-                slot = _coarsest(held_footprint, cell)
-                keep = footprint[row, column] < held_footprint[slot, cell]
-                for channel in range(3):
-                    out = held_colours[slot, channel, cell] if keep else new[channel]
-                    left_out[channel, cell] += np.float32(out)
-                if not keep:
-                    continue
-            held_footprint[slot, cell] = footprint[row, column]
-            held_weight[slot, cell] = weight[row, column]
-            for channel in range(3):
-                held_colours[slot, channel, cell] = new[channel]
+            _leave_out(words[slot, cell], cell, left_out)
+        words[slot, cell], footprint[cell, slot] = word, size
+        faded = border_weight(places[k, 0], places[k, 1], limits)
+        weight[slot, cell] = faded * sharpness_weight(size)
+        if held[cell] == depth:
+            coarsest[cell] = _coarsest(footprint, cell)
 
 
-put: Any = njit(cache=True, nogil=True)(_put)
+@compiled
+def by_depth(held: Any, depth: int) -> Any:  # noqa: ANN401
+    """Return the cells (n,) in order of how many views they hold, and where each number begins."""
+    begins = np.zeros(depth + 2, np.int64)
+    for cell in range(len(held)):
+        begins[held[cell] + 1] += 1
+    for k in range(depth + 1):
+        begins[k + 1] += begins[k]
+    order, place = np.empty(len(held), np.int64), begins.copy()
+    for cell in range(len(held)):
+        order[place[held[cell]]] = cell
+        place[held[cell]] += 1
+    return order, begins
+
+
+@compiled
+def add_held(words: Any, held: Any, left_out: Any) -> None:  # noqa: ANN401
+    """Add the colours held to those left out."""
+    for k in range(len(words)):
+        for cell in range(len(held)):
+            if k < held[cell]:
+                _leave_out(words[k, cell], cell, left_out)
+
+
+@compiled
+def to_levels(half_levels: Any, share: Any, picture: Any) -> None:  # noqa: ANN401
+    """Fill a picture (cells, 3) with half levels (3, cells) times a share (cells,), rounded."""
+    for cell in range(len(picture)):
+        for channel in range(3):
+            level = np.rint(half_levels[channel, cell] * share[cell])
+            picture[cell, channel] = np.uint8(min(max(level, np.float32(0.0)), np.float32(255.0)))

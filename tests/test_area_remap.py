@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from groundfuse.frontend.area_remap import area_remap, singular_values
+from groundfuse.frontend.area_remap import area_plan, area_read, singular_values
 
 
 def test_jacobians_have_the_singular_values_of_numpy():
@@ -14,5 +14,6 @@ def test_jacobians_have_the_singular_values_of_numpy():
 
 def test_a_tile_without_wanted_cells_is_no_error():
     source = np.full((6, 6, 2), np.nan)
-    got = area_remap([np.zeros((9, 9), np.uint8)], source, np.zeros((4, 4), bool))
+    plan = area_plan(source, np.zeros((4, 4), bool))
+    got = area_read([np.zeros((9, 9), np.uint8)], plan)
     assert got.shape == (4, 4)

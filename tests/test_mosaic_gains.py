@@ -5,7 +5,6 @@ from analytic_floor import centres, make_camera, ring, rounded, view_of, waves
 
 from groundfuse.backend.measurement import FrameId, Se2
 from groundfuse.frontend.gains import (
-    Exposure,
     Samples,
     estimate_exposure,
     neutral_exposure,
@@ -45,7 +44,7 @@ def test_gains_and_falloffs_are_found_among_obstacles():
     radius2 = np.linspace(0, 1, 11)
     for lens in (0, 1):
         expected = radius2[:, None] ** np.array([1, 2, 3]) @ falloff[lens]
-        shape = found.log_factor(lens, radius2)[:, 0] - found.log_gain[lens, 0]
+        shape = radius2[:, None] ** np.array([1, 2, 3]) @ found.falloff[lens]
         # A constant may hide in the gains of all views of a lens.
         difference = shape - expected
         assert np.abs(difference - difference.mean()).max() < 2 * TOLERANCE_LOG_GAIN
@@ -69,13 +68,6 @@ def test_views_that_share_nothing_stay_as_they_are():
     assert (found.log_gain == 0.0).all()
     assert (found.falloff == 0.0).all()
     assert found.noise_levels == neutral_exposure(2).noise_levels
-
-
-def test_factor_is_the_sum_of_gain_and_powers_of_the_radius():
-    exposure = Exposure(np.array([[0.1, 0.2, 0.3]]), np.array([[0.5, -0.25, 2.0]]), 3.0)
-    found = exposure.log_factor(0, np.array([0.0, 2.0]))
-    fall = 0.5 * 2 - 0.25 * 4 + 2.0 * 8
-    np.testing.assert_allclose(found, [[0.1, 0.2, 0.3], [0.1 + fall, 0.2 + fall, 0.3 + fall]])
 
 
 def test_radius_is_one_half_diagonal_from_the_principal_point():
@@ -124,7 +116,6 @@ def test_dark_and_cut_off_values_do_not_vote():
     ]
     mosaic = build_mosaic(views)
     both = mosaic.count == 2
-    half = mosaic.floor[both].reshape(-1, 3)
     # The uncut half says 1.5 between the views, shared about evenly: sqrt(1.5) x 100.
-    values, counts = np.unique(half, return_counts=True)
-    assert abs(int(values[np.argmax(counts)]) - 122) <= 3
+    uncut = np.abs(mosaic.floor[both].astype(int) - 122) <= 3
+    assert uncut.mean() > 0.48

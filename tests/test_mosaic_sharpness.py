@@ -9,8 +9,8 @@ from analytic_floor import centres, make_camera, rounded, view_of
 from groundfuse.backend.measurement import FrameId, Se2
 from groundfuse.frontend.area_remap import point_values
 from groundfuse.frontend.mosaic import MosaicOptions, build_mosaic
-from groundfuse.frontend.mosaic_tile import sharpness_weight
 from groundfuse.frontend.overhead import floor_from_rays
+from groundfuse.frontend.tile_compiled import sharpness_weight
 
 RAYS = 5  # a side: their mean is the mean over a pixel to 1/200 of the wave's curvature
 
@@ -99,7 +99,8 @@ def test_coarse_views_hardly_blur_what_a_fine_one_shows():
 
 
 def test_weights_follow_the_footprint_where_it_blurs_and_level_off_where_not():
-    weight = sharpness_weight(np.array([0.05, 0.1, 1.0, 2.0, 8.0, 16.0], np.float32))
+    sizes = np.array([0.05, 0.1, 1.0, 2.0, 8.0, 16.0], np.float32)
+    weight = np.array([sharpness_weight(size) for size in sizes])
     assert (np.diff(weight) < 0.0).all()
     assert 8.0 < weight[2] / weight[3] < 16.0
     np.testing.assert_allclose(weight[4] / weight[5], 16.0, rtol=0.02)

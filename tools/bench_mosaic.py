@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from groundfuse.backend.measurement import Attitude, FrameId, Se2
-from groundfuse.frontend import mosaic_tile, selection
+from groundfuse.frontend import selection, selection_compiled
 from groundfuse.frontend.arrays import Image
 from groundfuse.frontend.camera import Camera, Intrinsics, Mount
 from groundfuse.frontend.mosaic import MosaicOptions, MosaicView, build_mosaic
@@ -58,13 +58,13 @@ def bench_combining(depths: Sequence[int]) -> None:
     print(f"{'views':>7}{'as run':>10}{'numpy':>10}{'median':>10}{'as run / median':>17}")
     for depth in depths:
         colours, footprint = noisy_views(depth)
-        weight = mosaic_tile.sharpness_weight(footprint)
+        weight = np.float32(1.0) / footprint**4
 
         def run(rule: Callable[..., Any], arguments: tuple[Any, ...]) -> float:
             return NUM_CELLS / 1e6 / fastest_s(lambda: rule(*arguments))
 
         arguments = (colours, footprint, weight, NOISE_HALF_LEVELS, 3.0)
-        ours = run(mosaic_tile.combined, arguments)
+        ours = run(selection_compiled.combined, arguments)
         plain = run(selection.combined, arguments)
         peer = run(lambda values: np.median(values, axis=0), (colours,))
         print(f"{depth:7d}{ours:10.2f}{plain:10.2f}{peer:10.2f}{ours / peer:17.1f}", flush=True)
