@@ -5,17 +5,16 @@ stride; the local contrast normalisation makes low-contrast floors usable; a den
 keeps the near, finely resolved part of the picture from taking all features.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from groundfuse.backend.measurement import Attitude
-from groundfuse.frontend.arrays import Floats, Image, Mask, Points
+from groundfuse.frontend.arrays import Floats, Image, Mask, Picture32, Points
 from groundfuse.frontend.camera import Camera
+from groundfuse.frontend.keypoints import Keypoints, blobs, corners
 from groundfuse.frontend.normalise import local_contrast
 from groundfuse.frontend.overhead import floor_from_rays, rays_from_floor
 from groundfuse.frontend.overhead_view import (
@@ -26,8 +25,8 @@ from groundfuse.frontend.overhead_view import (
 )
 from groundfuse.frontend.repetition import repetition
 
-SURPLUS = 1.6
-"""Features described per feature kept: the strongest anywhere, then spread over the floor."""
+INNER = np.ones((9, 9), np.uint8)
+"""Features keep half of this away from the end of the floor."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,8 +40,8 @@ class FeatureOptions:
         max_features: most features kept of one frame.
         contrast_radius_px: neighbourhood of the contrast normalisation, overhead pixels.
         contrast_floor_grey: smallest local standard deviation, grey values.
-        contrast_gain_grey: grey values per local standard deviation.
-        contrast_threshold: SIFT's, on the normalised view.
+        contrast_gain_grey: grey values per local standard deviation, for ORB.
+        contrast_threshold: SIFT's, local standard deviations that a blob stands out at least.
         sigma_overhead_px: localisation noise of a feature in the overhead view.
         sigma_image_px: localisation noise that the picture itself adds.
         cell_px: side of the cells over which the features are spread, overhead pixels.
@@ -55,7 +54,7 @@ class FeatureOptions:
     contrast_radius_px: float = 12.0
     contrast_floor_grey: float = 1.5
     contrast_gain_grey: float = 40.0
-    contrast_threshold: float = 0.02
+    contrast_threshold: float = 0.0425
     sigma_overhead_px: float = 0.15
     sigma_image_px: float = 0.15
     cell_px: int = 48
@@ -110,22 +109,18 @@ def detect(
     grid = overhead_grid(camera, attitude, options.overhead)
     view, mask = overhead_view(np.asarray(grey, dtype=np.uint8), camera, attitude, grid)
     normalised = local_contrast(view, mask, options.contrast_radius_px, options.contrast_floor_grey)
-    flat = np.clip(128.0 + options.contrast_gain_grey * normalised, 0, 255).astype(np.uint8)
     wanted = _wanted(mask, grid, camera.mount.attitude.height_m, options)
-    keypoints, descriptors = _found(flat, mask, wanted, options)
-    points = np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2)
-    floor = grid.floor_from_overhead(points)
+    found = _found(normalised, mask, wanted, options)
+    floor = grid.floor_from_overhead(found.points_px)
     rays = rays_from_floor(attitude, floor)
     wobble = _wobble(attitude, sigma, floor, rays)
-    # An image angle runs clockwise from "right" = -y; foot x is "up".
-    angle = np.radians([-k.angle - 90.0 for k in keypoints])
     return Features(
         floor,
         rays,
         _sigma(attitude, floor, grid, camera, options),
-        np.log(np.array([k.size for k in keypoints], dtype=np.float64) * grid.m_per_px),
-        angle,
-        descriptors,
+        np.log(found.size_px * grid.m_per_px),
+        -found.angle_rad - np.pi / 2.0,  # clockwise from "right" = -y; foot x is "up"
+        found.descriptors,
         grid,
         attitude.height_m,
         *wobble,
@@ -138,46 +133,13 @@ def _wanted(mask: Mask, grid: OverheadGrid, height_m: float, options: FeatureOpt
     return min(options.max_features, round(options.per_square_height * area_heights))
 
 
-def _found(
-    flat: Image, mask: Mask, wanted: int, options: FeatureOptions
-) -> tuple[list[cv2.KeyPoint], np.ndarray[Any, Any]]:
+def _found(normalised: Picture32, mask: Mask, wanted: int, options: FeatureOptions) -> Keypoints:
     """Detect, spread over the floor, describe."""
-    inner = cv2.erode(mask.astype(np.uint8), np.ones((9, 9), np.uint8), borderValue=0)
-    if options.kind == "orb":
-        orb = cv2.ORB.create(nfeatures=4 * wanted + 1, fastThreshold=10, nlevels=4)
-        many = orb.detect(flat, inner)
-        kept = [many[i] for i in _spread(many, wanted, options.cell_px)]
-        found, bits = orb.compute(flat, kept)
-        return list(found), np.zeros((0, 32), np.uint8) if bits is None else bits
-    # Describing a surplus costs less than building the pyramid a second time for the chosen ones.
-    sift = cv2.SIFT.create(
-        nfeatures=round(SURPLUS * wanted),
-        contrastThreshold=options.contrast_threshold,
-        edgeThreshold=10,
-        enable_precise_upscale=True,
-    )
-    many, described = sift.detectAndCompute(flat, inner)
-    if described is None:
-        return [], np.zeros((0, 128), np.float32)
-    chosen = _spread(many, wanted, options.cell_px)
-    rows = described[chosen].astype(np.float32)
-    root = np.sqrt(rows / np.maximum(rows.sum(axis=1, keepdims=True), 1e-9))
-    return [many[i] for i in chosen], root
-
-
-def _spread(keypoints: Sequence[cv2.KeyPoint], wanted: int, cell_px: int) -> NDArray[np.int64]:
-    """Choose the strongest of every cell in turn, so that all of the floor is covered."""
-    if len(keypoints) <= wanted:
-        return np.arange(len(keypoints))
-    points = np.array([k.pt for k in keypoints])
-    response = np.array([k.response for k in keypoints])
-    cell = (points // cell_px).astype(np.int64)
-    key = cell[:, 0] * 100_000 + cell[:, 1]
-    order = np.lexsort((points[:, 1], points[:, 0], -response, key))
-    starts = np.flatnonzero(np.r_[True, key[order][1:] != key[order][:-1]])
-    place = np.arange(len(order)) - np.repeat(starts, np.diff(np.r_[starts, len(order)]))
-    chosen = order[np.lexsort((-response[order], place))[:wanted]]
-    return np.sort(chosen)
+    inner = np.asarray(cv2.erode(mask.astype(np.uint8), INNER, borderValue=0), dtype=np.bool_)
+    if options.kind == "sift":
+        return blobs(normalised, inner, wanted, options.contrast_threshold, options.cell_px)
+    flat = np.clip(128.0 + options.contrast_gain_grey * normalised, 0, 255).astype(np.uint8)
+    return corners(flat, inner, wanted, options.cell_px)
 
 
 def _sigma(

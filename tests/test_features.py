@@ -14,8 +14,9 @@ from scipy.spatial import cKDTree
 
 from groundfuse.backend.measurement import Attitude, FrameId, Se2
 from groundfuse.frontend.camera import Mount
-from groundfuse.frontend.features import FeatureOptions, _spread, detect
+from groundfuse.frontend.features import FeatureOptions, detect
 from groundfuse.frontend.fit import Prior
+from groundfuse.frontend.keypoints import spread
 from groundfuse.frontend.overhead import floor_from_rays, foot_from_cam, rays_from_floor
 
 BARREL = (-0.2, 0.05, 1e-3, -8e-4, 0.0)
@@ -182,14 +183,10 @@ def test_density_is_per_square_height_and_never_above_the_most():
 def test_few_features_are_spread_over_the_cells(seed, wanted):
     """The strongest of each cell before the second of any, and the strongest cells first."""
     rng = np.random.default_rng(seed)
-    keypoints = [
-        cv2.KeyPoint(float(u), float(v), 5.0, 0.0, float(r))
-        for (u, v), r in zip(rng.uniform(0, 200, (60, 2)), rng.uniform(0, 1, 60), strict=True)
-    ]
-    chosen = _spread(keypoints, wanted, 50)
+    points, strength = rng.uniform(0, 200, (60, 2)), rng.uniform(0, 1, 60)
+    chosen = spread(points, strength, wanted, 50)
     assert len(chosen) == len(set(chosen)) == min(wanted, 60)
-    strength = np.array([k.response for k in keypoints])
-    cell = np.array([(k.pt[0] // 50) * 10 + k.pt[1] // 50 for k in keypoints])
+    cell = (points // 50) @ (10, 1)
     place = np.array(
         [np.sum((cell == c) & (strength > r)) for c, r in zip(cell, strength, strict=True)]
     )
