@@ -5,6 +5,8 @@ import itertools
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from groundfuse.backend.measurement import FrameId
 from groundfuse.frontend.features import Features
 from groundfuse.frontend.retrieval import RetrievalOptions, retrieved
@@ -38,8 +40,10 @@ def retrieved_pairs(features: Mapping[FrameId, Features], options: PairOptions) 
     """
     order = sorted(features)
     sample = sorted(sorted(order, key=_lot)[: options.retrieval.num_sample])
+    names = sorted({frame.robot for frame in order})
+    robots = np.array([names.index(frame.robot) for frame in order], dtype=np.int64)
     found = retrieved(
-        (features[f] for f in order), (features[f] for f in sample), options.retrieval
+        (features[f] for f in order), (features[f] for f in sample), options.retrieval, robots
     )
     return [(order[i], order[j]) for i, j in found]
 

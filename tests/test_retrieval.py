@@ -1,5 +1,7 @@
 """Retrieval finds the frames that share floor, whoever took them and in whatever order."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from floor_pairs import camera, features_of, photo
@@ -8,7 +10,7 @@ from road_features import along_a_road, features
 from groundfuse.backend.measurement import FrameId, Se2
 from groundfuse.frontend import retrieval
 from groundfuse.frontend.features import FeatureOptions
-from groundfuse.frontend.retrieval import RetrievalOptions, learned, retrieved, votes
+from groundfuse.frontend.retrieval import RetrievalOptions, described, learned, retrieved, votes
 from groundfuse.tools.overlap import true_overlap
 
 OPTIONS = RetrievalOptions()
@@ -17,8 +19,8 @@ OPTIONS = RetrievalOptions()
 def table(frames, options=OPTIONS, sample=None):
     """Votes as a square table."""
     known = learned(frames if sample is None else sample, options)
-    found = votes(frames, known, options)
-    square = np.zeros((found.num_frames, found.num_frames))
+    found = votes(described(frames, known, options), known, options)
+    square = np.zeros((len(frames), len(frames)))
     square[tuple(found.pairs.T)] = found.weight
     return square + square.T
 
@@ -56,14 +58,16 @@ def test_only_candidates_are_voted_for():
     for count in (20, 40):
         frames = along_a_road(count, 30, np.random.default_rng(11), seen=40)
         known = learned(frames, OPTIONS)
-        found = votes(frames, known, RetrievalOptions(num_candidates=6))
+        few = RetrievalOptions(num_candidates=6)
+        found = votes(described(frames, known, few), known, few)
         assert len(found.pairs) <= 6 * count
-    assert found.num_frames == 40
+    assert len(found.stranger) == 40
 
 
 def test_each_pair_is_counted_once_in_order_with_positive_votes():
     frames = along_a_road(30, 15, np.random.default_rng(1))
-    found = votes(frames, learned(frames, OPTIONS), RetrievalOptions(num_candidates=9))
+    few, known = RetrievalOptions(num_candidates=9), learned(frames, OPTIONS)
+    found = votes(described(frames, known, few), known, few)
     assert (found.pairs[:, 0] < found.pairs[:, 1]).all()
     assert found.pairs.tolist() == sorted(found.pairs.tolist())
     assert len({tuple(pair) for pair in found.pairs.tolist()}) == len(found.pairs)
@@ -125,6 +129,51 @@ def test_the_number_of_frames_per_frame_is_kept():
         assert 7 * most <= len(pairs) <= 14 * most
 
 
+def crowded():
+    """Robots 0 and 1 on one road at ten places; each sees every place in four frames of its own.
+
+    The other robot's frames show half of the same marks, its own nearly all.
+    """
+    rng = np.random.default_rng(21)
+    frames, robots, places = [], [], []
+    for place, marks in enumerate(rng.uniform(0.0, 1.0, (10, 90, 128)) ** 4):
+        for robot, rows in enumerate((marks[:60], marks[30:])):
+            for _ in range(4):
+                noisy = np.abs(rows + 0.05 * rng.standard_normal(rows.shape))
+                frames.append(
+                    features(np.sqrt(noisy / noisy.sum(axis=1, keepdims=True)).astype(np.float32))
+                )
+                robots.append(robot)
+                places.append(place)
+    return frames, np.array(robots), np.array(places)
+
+
+def test_other_robots_are_found_however_often_a_robot_sees_its_own_floor():
+    frames, robots, places = crowded()
+    options = RetrievalOptions(num_frames=3, num_others=2, num_candidates=20)
+    alone = retrieved(frames, frames, options)
+    assert all(robots[i] == robots[j] for i, j in alone)
+    both = retrieved(frames, frames, options, robots)
+    assert set(alone) <= set(both)
+    between = [(i, j) for i, j in both if robots[i] != robots[j]]
+    assert {frame for pair in between for frame in pair} == set(range(len(frames)))
+    assert all(places[i] == places[j] for i, j in between)
+
+
+def test_strangers_of_other_robots_are_not_returned():
+    """Where the other robot has not been, its best frames get what all its frames get."""
+    frames, robots, places = crowded()
+    kept = np.flatnonzero((robots == 0) | (places < 5))
+    few, robots, places = [frames[k] for k in kept], robots[kept], places[kept]
+    options = RetrievalOptions(num_frames=3, num_others=2, num_candidates=15)
+    between = [(i, j) for i, j in retrieved(few, few, options, robots) if robots[i] != robots[j]]
+    assert between
+    assert all(places[i] == places[j] for i, j in between)
+    every = dataclasses.replace(options, least_votes=0.0)
+    some = [(i, j) for i, j in retrieved(few, few, every, robots) if robots[i] != robots[j]]
+    assert any(places[i] != places[j] for i, j in some)
+
+
 def test_work_in_chunks_changes_nothing(monkeypatch):
     frames = along_a_road(30, 30, np.random.default_rng(6))
     options = RetrievalOptions(num_candidates=7)
@@ -170,7 +219,8 @@ def test_no_frame_one_frame_blank_frames():
     assert retrieved([], [], OPTIONS) == []
     assert retrieved([empty, empty], [empty], OPTIONS) == []
     assert retrieved(one, one, OPTIONS) == []
-    assert len(votes([], learned(one, OPTIONS), OPTIONS).pairs) == 0
+    known = learned(one, OPTIONS)
+    assert len(votes(described([], known, OPTIONS), known, OPTIONS).pairs) == 0
     tiny = features(np.ones((1, 128), np.float32) / np.sqrt(128.0))
     assert retrieved([tiny, tiny], [tiny], OPTIONS) == []  # one point has no principal component
 

@@ -149,7 +149,9 @@ def _similar(
         pairs = retrieved_pairs(AllFeatures(shelf, keys), options.pairs)
         return [(place[a], place[b]) for a, b in pairs]
 
-    parts = (code_of("groundfuse.frontend.pairs"), list(keys.values()), options.pairs.retrieval)
+    robots = [frame.robot for frame in order]
+    code, looks = code_of("groundfuse.frontend.pairs"), list(keys.values())
+    parts = (code, looks, robots, options.pairs.retrieval)
     found: tuple[tuple[int, int], ...] = store.kept("retrieval", "team", parts, work)
     return [(order[i], order[j]) for i, j in found]
 
