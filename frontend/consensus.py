@@ -120,7 +120,7 @@ def find_modes(
     motions = np.empty((options.max_hypotheses, 4))
     motions = motions[: draw(table, rng.random((2, options.num_draws)), limits, motions)]
     votes = np.zeros(len(motions), dtype=np.int64)
-    count_votes(table.slots(), motions, limits, votes)
+    count_votes(table, motions, limits, votes)
     modes: list[Mode] = []
     known = np.empty((options.num_modes, 4))
     while len(motions) and len(modes) < options.num_modes:
@@ -139,15 +139,14 @@ def find_modes(
 
 def _table(found: Candidates) -> Table:
     """Lay candidates out for the compiled loops."""
-    change = np.flatnonzero(found.index_a[1:] != found.index_a[:-1]) + 1
-    return Table(
-        np.hstack([found.floor_a, found.floor_b]),
-        np.column_stack([np.cos(found.turn_rad), np.sin(found.turn_rad)]).astype(np.float32),
-        np.cumsum(1.0 / (1.0 + found.rank)),
-        np.concatenate([[0], change, [len(found.index_a)]]),
-        found.index_b,
-        int(found.index_b.max()) + 1,
-    )
+    count = len(found.index_a)
+    places, turned = np.empty((count, 4)), np.empty((count, 2), dtype=np.float32)
+    places[:, :2], places[:, 2:] = found.floor_a, found.floor_b
+    turned[:, 0], turned[:, 1] = np.cos(found.turn_rad), np.sin(found.turn_rad)
+    first = np.flatnonzero(found.index_a[1:] != found.index_a[:-1]) + 1
+    starts = np.concatenate([[0], first, [count]])
+    cumulative = np.cumsum(1.0 / (1.0 + found.rank))
+    return Table(places, turned, cumulative, starts, found.index_b, int(found.index_b.max()) + 1)
 
 
 def _limits(
@@ -159,9 +158,9 @@ def _limits(
 ) -> Limits:
     """Return what is asked of a motion; a gate gives way by the tolerance that wobble needs."""
     centre = np.median(found.floor_b, axis=0)
-    size_m = float(np.sqrt(((found.floor_b - centre) ** 2).sum(axis=1).mean()))
     expected, gate_m, gate_rad = np.array([1.0, 0.0, 0.0, 0.0]), np.inf, np.inf
     if gate is not None:
+        size_m = float(np.sqrt(((found.floor_b - centre) ** 2).sum(axis=1).mean()))
         expected = _coefficients(gate.a_from_b)
         gate_m = gate.radius_m + tolerance_m
         gate_rad = gate.turn_rad + tolerance_m / max(size_m, tolerance_m)

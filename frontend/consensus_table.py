@@ -27,19 +27,6 @@ class Table(NamedTuple):
     index_b: np.ndarray
     num_b: int
 
-    def slots(self) -> Picture32:
-        """Return (k, 6, f) the first candidate of every feature of a, the second of every, ...
-
-        Six rows: x and y in a, x and y in b, cosine and sine of the turn; nan where there is none.
-        """
-        sizes = np.diff(self.starts)
-        slots = np.full((int(sizes.max()), len(sizes), 6), np.nan, dtype=np.float32)
-        feature = np.repeat(np.arange(len(sizes)), sizes)
-        place = np.arange(len(feature)) - self.starts[feature]
-        slots[place, feature, :4] = self.places
-        slots[place, feature, 4:] = self.turned
-        return np.ascontiguousarray(slots.transpose(0, 2, 1))
-
 
 class Limits(NamedTuple):
     """What is asked of a motion, in metres and radians.

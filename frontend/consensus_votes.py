@@ -13,18 +13,39 @@ from groundfuse.frontend.compiled import compiled, part
 from groundfuse.frontend.consensus_table import Limits, Table
 
 
+@part
+def _slots(table: Table) -> Picture32:
+    """Return the first candidate of every feature of a, the second of every, ... (k, 6, f).
+
+    Six rows: x and y in a, x and y in b, cosine and sine of the turn; nan where there is none. So
+    features, not candidates, are next to each other, and counting them is a vector operation.
+    """
+    depth = 0
+    for f in range(len(table.starts) - 1):
+        depth = max(depth, table.starts[f + 1] - table.starts[f])
+    slots = np.empty((depth, 6, len(table.starts) - 1), np.float32)
+    for f in range(len(table.starts) - 1):
+        for k in range(depth):
+            i = table.starts[f] + k
+            for row in range(6):
+                if i >= table.starts[f + 1]:
+                    slots[k, row, f] = math.nan
+                else:
+                    slots[k, row, f] = table.places[i, row] if row < 4 else table.turned[i, row - 4]
+    return slots
+
+
 @compiled
-def count_votes(slots: Picture32, motions: Floats, limits: Limits, votes: np.ndarray) -> None:
+def count_votes(table: Table, motions: Floats, limits: Limits, votes: np.ndarray) -> None:
     """Count the features of a with a candidate that a motion explains.
 
     Args:
-        slots: (k, 6, f) x and y in a, x and y in b, cosine and sine of the turn; first of every
-            feature's first candidate, then of every second. So features, not candidates, are next
-            to each other, and counting them is a vector operation. Nan where there is none.
+        table: candidates.
         motions: (m, 4).
         limits: see there.
         votes: (m,) are written.
     """
+    slots = _slots(table)
     nearest, least = np.float32(limits.tolerance_m**2), np.float32(limits.least_cos)
     hit = np.empty(slots.shape[2], np.int32)
     for m in range(len(motions)):

@@ -372,7 +372,7 @@ def test_votes_are_those_of_whole_matrices(seed, scaled):
     motions[:, :2] *= 1.1 if scaled else 1.0
     asked, table = limits(found, tolerance_m=0.03), _table(found)
     counts = np.empty(30, dtype=np.int64)
-    count_votes(table.slots(), motions, asked, counts)
+    count_votes(table, motions, asked, counts)
     c, s, x, y = (motions[:, k, None] for k in range(4))
     dx = c * found.floor_b[:, 0] - s * found.floor_b[:, 1] + x - found.floor_a[:, 0]
     dy = s * found.floor_b[:, 0] + c * found.floor_b[:, 1] + y - found.floor_a[:, 1]
