@@ -8,18 +8,20 @@ own colours are eliminated cell by cell; what stands on the floor is outvoted (C
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
+from scipy.sparse.linalg import splu
 
 from groundfuse.frontend.arrays import Floats, Mask
 from groundfuse.frontend.camera import Intrinsics
+from groundfuse.frontend.gains_compiled import POWERS, add_normal, cell_means
 
 Numbers = NDArray[np.intp]
 """(n,) which cell, view or lens."""
 
-POWERS = 3
 ITERATIONS = 12
 SMALLEST_SCALE = 0.01
 """One per cent: below, differences are rounding, and weights would follow it."""
@@ -98,69 +100,86 @@ def estimate_exposure(samples: Samples, lens_of_view: Numbers) -> Exposure:
     shared = seen[cell] > 1
     if not shared.any():
         return neutral_exposure(num_views)
-    _, cell = np.unique(cell[shared], return_inverse=True)
-    view, radius2 = samples.view[shared], samples.radius2[shared]
-    design = _design(view, radius2, lens_of_view, num_lenses)
-    values = np.log(np.maximum(samples.colour[shared], 1.0))
-    gain, falloff = _robust_fit(design, cell, values, num_views)
+    order = np.flatnonzero(shared)[np.argsort(cell[shared], kind="stable")]
+    view, radius2 = samples.view[order], samples.radius2[order]
+    begins = np.append(0, np.cumsum(seen[seen > 1]))
+    floor = _Floor(*_design(view, radius2, lens_of_view), begins)
+    values = np.log(np.maximum(samples.colour[order], 1.0))
+    gain, falloff = _robust_fit(floor, values, num_views, num_lenses)
     per_view = falloff.reshape(num_lenses, POWERS)[lens_of_view]
     found = Exposure(gain, per_view, USUAL_NOISE_LEVELS)
+    _, cell = np.unique(samples.cell[shared], return_inverse=True)
     return Exposure(gain, per_view, _noise(samples, shared, cell, found))
 
 
-def _design(
-    view: Numbers, radius2: Floats, lens_of_view: Numbers, num_lenses: int
-) -> sparse.csr_array:
-    """Rows of the linear model: which gain, and the powers of r under the lens's columns."""
-    rows = np.arange(len(view))
+class _Floor(NamedTuple):
+    """The linear model of samples in order of their cells.
+
+    Attributes:
+        columns: (n, POWERS + 1) the view's, and those of the powers of r under its lens.
+        entries: (n, POWERS + 1) of the design there.
+        begins: (cells + 1,) first sample of each cell, and the number of samples.
+    """
+
+    columns: Numbers
+    entries: Floats
+    begins: Numbers
+
+    def centred(self, weight: Floats, values: Floats) -> Floats:
+        """Return values (n, 3) less their cells' weighted means."""
+        means = np.empty((len(self.begins) - 1, 3))
+        cell_means(self.begins, weight, values, means)
+        rest: Floats = values - np.repeat(means, np.diff(self.begins), axis=0)
+        return rest
+
+
+def _design(view: Numbers, radius2: Floats, lens_of_view: Numbers) -> tuple[Numbers, Floats]:
+    """Return columns and entries of `_Floor`."""
     first = len(lens_of_view) + POWERS * lens_of_view[view]
-    columns = [view, *(first + power for power in range(POWERS))]
-    entries = [np.ones(len(view)), *(radius2 ** (power + 1) for power in range(POWERS))]
-    shape = (len(view), len(lens_of_view) + POWERS * num_lenses)
-    places = (np.tile(rows, POWERS + 1), np.concatenate(columns))
-    return sparse.csr_array((np.concatenate(entries), places), shape=shape)
+    columns = np.column_stack([view, first[:, None] + np.arange(POWERS)])
+    return columns, radius2[:, None] ** np.arange(POWERS + 1)
 
 
 def _robust_fit(
-    design: sparse.csr_array, cell: Numbers, values: Floats, num_views: int
+    floor: _Floor, values: Floats, num_views: int, num_lenses: int
 ) -> tuple[Floats, Floats]:
     """Least squares, reweighted: log gains (views, 3) and the falloffs' coefficients."""
-    members = sparse.csr_array((np.ones(len(cell)), (cell, np.arange(len(cell)))))
     weight = np.ones(len(values))
     gain, falloff = np.zeros((num_views, 3)), np.zeros(0)
     for _ in range(ITERATIONS):
-        gain, falloff = _solve(design, members, values, weight, num_views)
-        rest = values - (design[:, :num_views] @ gain) - (design[:, num_views:] @ falloff)[:, None]
-        centre = (members @ (weight[:, None] * rest)) / (members @ weight)[:, None]
-        distance = np.sqrt(np.mean((rest - centre[cell]) ** 2, axis=1))
+        gain, falloff = _solve(floor, values, weight, num_views, num_lenses)
+        known = np.append(np.zeros(num_views), falloff)[floor.columns[:, 1:]]
+        fall = (floor.entries[:, 1:] * known).sum(axis=1)
+        rest = floor.centred(weight, values - gain[floor.columns[:, 0]] - fall[:, None])
+        distance = np.sqrt(np.mean(rest**2, axis=1))
         scale = max(MAD_TO_SIGMA * float(np.median(distance)), SMALLEST_SCALE)
         weight = 1.0 / (1.0 + (distance / scale) ** 2)
     return gain, falloff
 
 
 def _solve(
-    design: sparse.csr_array,
-    members: sparse.csr_array,
-    values: Floats,
-    weight: Floats,
-    num_views: int,
+    floor: _Floor, values: Floats, weight: Floats, num_views: int, num_lenses: int
 ) -> tuple[Floats, Floats]:
     """Weighted least squares with each cell's own colour eliminated.
 
     The falloff is the same in all channels, so it follows from their mean, and then each channel's
-    gains follow on their own.
+    gains follow on their own. Few pairs of views share floor: the gains' block is sparse.
     """
-    weighted = design.multiply(weight[:, None]).tocsr()
-    per_cell = members @ weighted
-    share = per_cell.multiply(1.0 / (members @ weight)[:, None]).tocsr()
-    normal = (design.T @ weighted - share.T @ per_cell).toarray()
-    right = weighted.T @ values - share.T @ (members @ (weight[:, None] * values))
-    prior = np.full(len(normal), FALLOFF_PRIOR)
-    prior[:num_views] = GAIN_PRIOR * np.maximum(design[:, :num_views].T @ weight, 1.0)
+    size = num_views + POWERS * num_lenses
+    normal, right = np.zeros((size, size)), np.zeros((size, 3))
+    rest = floor.centred(weight, values)
+    add_normal(floor.columns, floor.entries, floor.begins, weight, rest, (normal, right))
+    samples = np.bincount(floor.columns[:, 0], weight, num_views)
+    prior = np.full(size, FALLOFF_PRIOR)
+    prior[:num_views] = GAIN_PRIOR * np.maximum(samples, 1.0)
     normal += np.diag(prior)
-    falloff = np.linalg.solve(normal, right.mean(axis=1))[num_views:]
-    known = (normal[:num_views, num_views:] @ falloff)[:, None]
-    gain = np.linalg.solve(normal[:num_views, :num_views], right[:num_views] - known)
+    gains, both = slice(0, num_views), normal[:num_views, num_views:]
+    solved = splu(sparse.csc_array(normal[gains, gains])).solve
+    # Block elimination: the falloff of the mean channel first.
+    of_falloff = normal[num_views:, num_views:] - both.T @ solved(both)
+    mean = right.mean(axis=1)
+    falloff = np.linalg.solve(of_falloff, mean[num_views:] - both.T @ solved(mean[gains]))
+    gain: Floats = solved(right[gains] - (both @ falloff)[:, None])
     return gain, falloff
 
 

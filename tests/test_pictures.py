@@ -103,7 +103,7 @@ def test_layers_decode_to_what_they_show(made):
 
 
 def test_counts_too_high_for_a_grey_value_stay_white(tmp_path):
-    pictures._write_layers(tmp_path, "x", small_mosaic())
+    pictures._write_layers(tmp_path, "x", small_mosaic(), 2)
     assert decoded(tmp_path / "x_count.png").tolist() == [[0, 16, 32], [48, 240, 255]]
     assert decoded(tmp_path / "x_few.png").tolist() == [[0, 255, 255], [0, 0, 0]]
 

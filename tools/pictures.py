@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -68,7 +69,7 @@ def write_mosaics(
             except ValueError as error:
                 raise TeamError(f"mosaic of component {component}: {error}") from error
         with watch.stage("writing"):
-            _write_layers(out, name, mosaic)
+            _write_layers(out, name, mosaic, num_workers)
         mosaics[component] = mosaic
     return mosaics
 
@@ -133,15 +134,24 @@ def write_overheads(out: Path, fused: Fused, options: OverheadOptions) -> None:
         write_png(out / "overhead" / f"{frame}.png", view)
 
 
-def _write_layers(out: Path, stem: str, mosaic: Mosaic) -> None:
+def _write_layers(out: Path, stem: str, mosaic: Mosaic, num_workers: int) -> None:
+    """Write the layers, several at a time: compressing them takes as long as a few pictures do."""
     count = np.minimum(mosaic.count.astype(np.int64) * COUNT_GREY, 255).astype(np.uint8)
-    uncertain = np.where(mosaic.uncertain, 255, 0).astype(np.uint8)
-    alpha = np.where(mosaic.count > 0, 255, 0).astype(np.uint8)[..., None]  # unseen: transparent
-    floor, mean = (np.concatenate([part, alpha], axis=2) for part in (mosaic.floor, mosaic.mean))
-    layers = (("", floor), ("_mean", mean), ("_count", count), ("_few", uncertain))
-    for suffix, picture in layers:
-        write_png(out / f"{stem}{suffix}.png", picture)
+    alpha = np.where(mosaic.count > 0, 255, 0).astype(np.uint8)  # unseen: transparent
+
+    def write(suffix: str, picture: Callable[[], np.ndarray]) -> None:
+        write_png(out / f"{stem}{suffix}.png", picture())
         write_atomic(out / f"{stem}{suffix}.pgw", world_file(mosaic))
+
+    layers: tuple[tuple[str, Callable[[], np.ndarray]], ...] = (
+        ("", lambda: np.dstack([mosaic.floor, alpha])),
+        ("_mean", lambda: np.dstack([mosaic.mean, alpha])),
+        ("_count", lambda: count),
+        ("_few", lambda: np.where(mosaic.uncertain, 255, 0).astype(np.uint8)),
+    )
+    with ThreadPoolExecutor(num_workers) as threads:
+        for done in [threads.submit(write, *layer) for layer in layers]:
+            done.result()
 
 
 def world_file(mosaic: Mosaic) -> str:
