@@ -1,11 +1,12 @@
 """Local contrast normalisation: bare concrete becomes as lively as gravel."""
 
-from typing import Any
-
 import cv2
 import numpy as np
 
 from groundfuse.frontend.arrays import Image, Mask, Picture32
+
+PIXELS_PER_RADIUS = 3.0
+COARSEST_PX = 4
 
 
 def local_contrast(grey: Image, mask: Mask, radius_px: float, floor_grey: float) -> Picture32:
@@ -18,18 +19,26 @@ def local_contrast(grey: Image, mask: Mask, radius_px: float, floor_grey: float)
         floor_grey: smallest standard deviation, so that noise is not blown up.
     """
     weight = mask.astype(np.float32)
-    value = np.asarray(grey.astype(np.float32) * weight, dtype=np.float32)
-    scale = np.maximum(_blurred(weight, radius_px), 1e-3)
-    mean = _blurred(value, radius_px) / scale
-    square = _blurred(value * value, radius_px) / scale
+    # Squares of differences from a middle grey are small enough for single precision.
+    middle = np.float32(round(cv2.mean(grey, mask.astype(np.uint8))[0]))
+    value = np.asarray((grey.astype(np.float32) - middle) * weight, dtype=np.float32)
+    step = min(COARSEST_PX, max(1, int(radius_px / PIXELS_PER_RADIUS)))
+    scale = np.maximum(_around(weight, radius_px, step), 1e-3)
+    mean = _around(value, radius_px, step) / scale
+    square = _around(value * value, radius_px, step) / scale
     deviation = np.sqrt(np.maximum(square - mean * mean, floor_grey**2))
-    return np.asarray((value - mean) / deviation * weight, dtype=np.float32)
+    size = weight.shape[::-1]
+    means = cv2.resize(mean, size, interpolation=cv2.INTER_LINEAR)
+    gains = cv2.resize(1.0 / deviation, size, interpolation=cv2.INTER_LINEAR)
+    value -= means
+    value *= gains
+    value *= weight
+    return value
 
 
-def _blurred(picture: Picture32, radius_px: float) -> Picture32:
-    """Gaussian by three box filters of the same variance: cost does not grow with the radius."""
-    width = 2 * round((np.sqrt(4.0 * radius_px**2 + 1.0) - 1.0) / 2.0) + 1
-    blurred: Any = picture
-    for _ in range(3):
-        blurred = cv2.blur(blurred, (width, width), borderType=cv2.BORDER_REFLECT)
+def _around(picture: Picture32, radius_px: float, step: int) -> Picture32:
+    """Gaussian means of blocks of `step` x `step` pixels: so smooth a picture needs no more."""
+    rows, columns = (max(1, side // step) for side in picture.shape)
+    coarse = cv2.resize(picture, (columns, rows), interpolation=cv2.INTER_AREA)
+    blurred = cv2.GaussianBlur(coarse, (0, 0), radius_px / step, borderType=cv2.BORDER_REFLECT)
     return np.asarray(blurred, dtype=np.float32)

@@ -21,6 +21,9 @@ TILE_PX = 256
 """Raster pixels per tile: remap takes no picture of 32767 px or more, and no tile needs many."""
 PLANS_KEPT = 4
 """Some 10 MB each; a team of many cameras works them out again."""
+GRIDS_KEPT = 256
+LATTICES_KEPT = 16
+"""Half a megabyte each."""
 LATTICE_STEP_PX = 4
 
 
@@ -95,7 +98,11 @@ def overhead_grid(
     Raises:
         ValueError: no floor is resolved, or the raster would have more than `max_cells` cells.
     """
-    options = options or OverheadOptions()
+    return _grid(camera, attitude, options or OverheadOptions())
+
+
+@functools.lru_cache(maxsize=GRIDS_KEPT)
+def _grid(camera: Camera, attitude: Attitude, options: OverheadOptions) -> OverheadGrid:
     cell_m = raster_cell_m(camera, options)
     floor, footprint = _sampled_floor(camera, attitude)
     distance = np.hypot(floor[:, 0], floor[:, 1])
@@ -163,16 +170,26 @@ def _planned_tiles(
 
 def _sampled_floor(camera: Camera, attitude: Attitude) -> tuple[Points, Floats]:
     """Floor points of a lattice over the used rows, and the length of one pixel there."""
+    u, v, rays = _lattice(camera)
+    floor = floor_from_rays(attitude, rays)
+    lattice = floor.reshape(len(v), len(u), 2)
+    by_v = np.asarray(np.gradient(lattice, v, axis=0), dtype=np.float64)
+    by_u = np.asarray(np.gradient(lattice, u, axis=1), dtype=np.float64)
+    return floor, singular_values(by_u, by_v)[0].ravel()
+
+
+@functools.lru_cache(maxsize=LATTICES_KEPT)
+def _lattice(camera: Camera) -> tuple[Floats, Floats, Points]:
+    """Columns, rows and rays of a lattice; attitudes may change from frame to frame."""
     first, last = camera.used_rows
     width = camera.intrinsics.width_px
     u = np.linspace(0.0, width - 1.0, max(2, width // LATTICE_STEP_PX + 1))
     v = np.linspace(first, last, max(2, (last - first) // LATTICE_STEP_PX + 1))
     px = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-    floor = floor_from_rays(attitude, camera.intrinsics.rays_from_px(px))
-    lattice = floor.reshape(len(v), len(u), 2)
-    by_v = np.asarray(np.gradient(lattice, v, axis=0), dtype=np.float64)
-    by_u = np.asarray(np.gradient(lattice, u, axis=1), dtype=np.float64)
-    return floor, singular_values(by_u, by_v)[0].ravel()
+    rays = camera.intrinsics.rays_from_px(px)
+    for array in (u, v, rays):
+        array.setflags(write=False)
+    return u, v, rays
 
 
 def _widest_ray(camera: Camera) -> float:

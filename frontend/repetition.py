@@ -20,12 +20,21 @@ FAINTEST = 0.05
 """Standard deviation below which a view holds no floor but rounding: a blank picture."""
 
 
-def _convolved(one: Picture32, two: Picture32) -> Picture32:
-    """Return all of the convolution; scipy.signal does the same but takes seconds to import."""
-    size = [m + n - 1 for m, n in zip(one.shape, two.shape, strict=True)]
-    fast = [cv2.getOptimalDFTSize(side) for side in size]
-    product = np.fft.irfft2(np.fft.rfft2(one, fast) * np.fft.rfft2(two, fast), fast)
-    return np.asarray(product[: size[0], : size[1]], dtype=np.float32)
+def _spectrum(picture: Picture32) -> Picture32:
+    """Return the transform of a picture with room for every shift."""
+    rows, columns = (cv2.getOptimalDFTSize(2 * side - 1) for side in picture.shape)
+    padded = np.zeros((rows, columns), dtype=np.float32)
+    padded[: picture.shape[0], : picture.shape[1]] = picture
+    return np.asarray(cv2.dft(padded), dtype=np.float32)
+
+
+def _correlated(one: Picture32, two: Picture32, shape: tuple[int, ...]) -> Picture32:
+    """Return sums of products at all shifts, none in the middle, of two spectra of pictures."""
+    product = cv2.mulSpectrums(one, two, 0, conjB=True)
+    sums = cv2.idft(product, flags=cv2.DFT_SCALE | cv2.DFT_REAL_OUTPUT)
+    before = [side - 1 for side in shape]
+    rolled = np.roll(np.asarray(sums, dtype=np.float32), before, axis=(0, 1))
+    return rolled[: 2 * shape[0] - 1, : 2 * shape[1] - 1]
 
 
 def repetition(normalised: Picture32, mask: Mask) -> float:
@@ -44,10 +53,11 @@ def repetition(normalised: Picture32, mask: Mask) -> float:
     # A neighbourhood average removes noise that no repetition could survive.
     shrunk = cv2.resize(normalised, size, interpolation=cv2.INTER_AREA)
     value = np.asarray(np.asarray(shrunk) * weight, dtype=np.float32)
-    product = _convolved(value, value[::-1, ::-1])
-    power = _convolved(value * value, weight[::-1, ::-1])
+    of_value, of_square, of_weight = (_spectrum(p) for p in (value, value * value, weight))
+    product = _correlated(of_value, of_value, value.shape)
+    power = _correlated(of_square, of_weight, value.shape)
     norm = np.sqrt(np.maximum(power * power[::-1, ::-1], 0.0))
-    overlap = _convolved(weight, weight[::-1, ::-1])
+    overlap = _correlated(of_weight, of_weight, value.shape)
     rows, columns = product.shape
     away = np.hypot(
         *np.ogrid[-(rows // 2) : rows - rows // 2, -(columns // 2) : columns - columns // 2]
