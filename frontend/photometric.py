@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from groundfuse.backend.measurement import Attitude, Se2
-from groundfuse.backend.reprojection import transfer
 from groundfuse.frontend.arrays import Floats, Image, Mask, Picture32, Points
 from groundfuse.frontend.camera import Camera, Intrinsics
 from groundfuse.frontend.fit import Prior
+from groundfuse.frontend.fit_compiled import transfer_rows
 from groundfuse.frontend.normalise import local_contrast
 
 RAY_STEP = 1e-6
@@ -193,14 +193,26 @@ def _points(
     inside = _inside(points, a.camera)
     points = points[inside]
     rays = a.camera.intrinsics.rays_from_px(points)
-    got = transfer(rays, attitude[:3], pose.vector(), attitude[3:])
-    in_b = b.camera.intrinsics.px_from_rays(got.rays_b)
-    stretch = np.linalg.svd(np.nan_to_num(got.by_rays_a), compute_uv=False)
+    rows = _rows(rays, pose, attitude)
+    in_b = b.camera.intrinsics.px_from_rays(rows[:, :, 11])
+    finest, coarsest = _stretches(rows[:, :, 9:11])
     ratio = b.camera.intrinsics.focal_px / a.camera.intrinsics.focal_px
-    fits = (stretch[:, 0] * ratio < options.max_stretch) & (
-        stretch[:, 1] * ratio > 1.0 / options.max_stretch
-    )
+    fits = (finest * ratio < options.max_stretch) & (coarsest * ratio > 1.0 / options.max_stretch)
     return points[fits & _inside(in_b, b.camera)]
+
+
+def _stretches(by_rays_a: Floats) -> tuple[Floats, Floats]:
+    """Return the larger and the smaller singular value (n,) of matrices (n, 2, 2); nan stays."""
+    (a, b), (c, d) = by_rays_a[:, 0].T, by_rays_a[:, 1].T
+    turning, mirroring = np.hypot(a + d, c - b), np.hypot(a - d, c + b)
+    return (turning + mirroring) / 2.0, np.abs(turning - mirroring) / 2.0
+
+
+def _rows(rays_a: Points, pose: Se2, attitude: Floats) -> Floats:
+    """Return rows (n, 2, 12) as the fit has them: by nine parameters, by the ray, the ray in b."""
+    rows = np.empty((len(rays_a), 2, 12))
+    transfer_rows(rays_a, np.concatenate([pose.vector(), attitude]), rows)
+    return rows
 
 
 def _slope(picture: Picture32, right: int, down: int) -> Picture32:
@@ -239,18 +251,18 @@ def _linearised(
     light: Floats,
 ) -> tuple[Floats, Floats]:
     """Grey residuals (n,) and their Jacobian (n, 11): motion, attitudes, gain, offset."""
-    got = transfer(rays_a, attitude[:3], pose.vector(), attitude[3:])
-    px = lens.px_from_rays(got.rays_b)
+    rows = _rows(rays_a, pose, attitude)
+    rays_b = rows[:, :, 11]
+    px = lens.px_from_rays(rays_b)
     lost = ~np.isfinite(px).all(axis=1)
     by_ray = np.stack(
-        [(lens.px_from_rays(got.rays_b + RAY_STEP * unit) - px) / RAY_STEP for unit in np.eye(2)],
+        [(lens.px_from_rays(rays_b + RAY_STEP * unit) - px) / RAY_STEP for unit in np.eye(2)],
         axis=2,
     )
     slope = np.stack([_sampled(s, px) for s in slopes], axis=1)
-    by_parameters = np.concatenate([got.by_pose, got.by_attitude_a, got.by_attitude_b], axis=2)
     by_light = np.stack([-wanted, -np.ones_like(wanted)], axis=1)
     along = np.einsum("ni,nij->nj", slope, by_ray)
-    by_nine: Floats = np.einsum("ni,nij->nj", along, by_parameters)
+    by_nine: Floats = np.einsum("ni,nij->nj", along, rows[:, :, :9])
     jacobian = np.column_stack([by_nine, by_light])
     error: Floats = _sampled(picture_b, px) - light[0] * wanted - light[1]
     error[lost], jacobian[lost] = 0.0, 0.0

@@ -279,3 +279,12 @@ def test_the_priors_hold_what_the_pictures_do_not_show():
     loose = align(*greys, truth, *free, known, OPTIONS)
     assert loose.covariance[0, 0] > 4.0 * tight.covariance[0, 0]
     assert prior().sigma.height_m < 0.05
+
+
+def test_stretches_are_singular_values():
+    """Of a few mirrored, singular and unknown ones too."""
+    matrices = np.random.default_rng(4).standard_normal((50, 2, 2))
+    matrices[0], matrices[1], matrices[2, 1] = 0.0, [[1.0, 2.0], [2.0, 4.0]], [0.0, 0.0]
+    found = np.stack(photometric._stretches(matrices), axis=1)
+    np.testing.assert_allclose(found, np.linalg.svd(matrices, compute_uv=False), atol=1e-14)
+    assert np.isnan(photometric._stretches(np.full((1, 2, 2), np.nan))).all()
