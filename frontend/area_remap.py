@@ -9,6 +9,8 @@ import numpy as np
 from groundfuse.frontend.arrays import Floats, Image, Mask, Picture32
 
 MAX_SUPERSAMPLING = 8
+PX_PER_SAMPLE = 1.25
+"""Samples reach two pixels each (bilinear), so that none in between is passed over."""
 JACOBIAN_STEP = 4
 """The scale of the picture is looked at in every fourth cell of every fourth row."""
 OUTSIDE_PX = -1e4
@@ -109,5 +111,6 @@ def _level_and_factor(source_px: Floats, wanted: Mask) -> tuple[int, int]:
     kept = wanted[some, some] & np.isfinite(most)
     most, least = most[kept], least[kept]
     level = math.floor(math.log2(max(least.min(), 2.0) / 2.0)) if least.size else 0
-    samples = math.ceil(most.max(initial=1.0) / 2.0**level - 1e-9)
+    longest = float(most.max(initial=1.0)) / 2.0**level
+    samples = 1 if longest <= 1.0 + 1e-9 else max(2, math.ceil(longest / PX_PER_SAMPLE - 1e-9))
     return level, min(MAX_SUPERSAMPLING, samples)
