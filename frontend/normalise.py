@@ -18,27 +18,31 @@ def local_contrast(grey: Image, mask: Mask, radius_px: float, floor_grey: float)
         radius_px: sigma of the Gaussian neighbourhood.
         floor_grey: smallest standard deviation, so that noise is not blown up.
     """
-    weight = mask.astype(np.float32)
+    step = min(COARSEST_PX, max(1, int(radius_px / PIXELS_PER_RADIUS)))
+    rows, columns = grey.shape
+    # Whole blocks: what is added has no weight.
+    shape = [-(-side // step) * step for side in grey.shape]
+    weight, value = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
+    weight[:rows, :columns] = mask
     # Squares of differences from a middle grey are small enough for single precision.
     middle = np.float32(round(cv2.mean(grey, mask.astype(np.uint8))[0]))
-    value = np.asarray((grey.astype(np.float32) - middle) * weight, dtype=np.float32)
-    step = min(COARSEST_PX, max(1, int(radius_px / PIXELS_PER_RADIUS)))
+    np.subtract(grey, middle, out=value[:rows, :columns])
+    value *= weight
     scale = np.maximum(_around(weight, radius_px, step), 1e-3)
     mean = _around(value, radius_px, step) / scale
     square = _around(value * value, radius_px, step) / scale
     deviation = np.sqrt(np.maximum(square - mean * mean, floor_grey**2))
-    size = weight.shape[::-1]
-    means = cv2.resize(mean, size, interpolation=cv2.INTER_LINEAR)
-    gains = cv2.resize(1.0 / deviation, size, interpolation=cv2.INTER_LINEAR)
-    value -= means
-    value *= gains
+    size = (shape[1], shape[0])
+    value -= cv2.resize(mean, size, interpolation=cv2.INTER_LINEAR)
+    value *= cv2.resize(1.0 / deviation, size, interpolation=cv2.INTER_LINEAR)
     value *= weight
-    return value
+    return value[:rows, :columns]
 
 
 def _around(picture: Picture32, radius_px: float, step: int) -> Picture32:
     """Gaussian means of blocks of `step` x `step` pixels: so smooth a picture needs no more."""
-    rows, columns = (max(1, side // step) for side in picture.shape)
-    coarse = cv2.resize(picture, (columns, rows), interpolation=cv2.INTER_AREA)
+    rows, columns = picture.shape
+    size = (columns // step, rows // step)
+    coarse = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
     blurred = cv2.GaussianBlur(coarse, (0, 0), radius_px / step, borderType=cv2.BORDER_REFLECT)
     return np.asarray(blurred, dtype=np.float32)
