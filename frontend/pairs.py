@@ -9,9 +9,10 @@ import numpy as np
 
 from groundfuse.backend.measurement import FrameId
 from groundfuse.frontend.features import Features
+from groundfuse.frontend.predicted import Pair, PredictedOptions
 from groundfuse.frontend.retrieval import RetrievalOptions, retrieved
 
-Pair = tuple[FrameId, FrameId]
+__all__ = ["Pair", "PairOptions", "neighbour_pairs", "retrieved_pairs", "skip_pairs"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -20,10 +21,12 @@ class PairOptions:
 
     Attributes:
         retrieval: see `RetrievalOptions`.
+        predicted: pairs of a second round; see `PredictedOptions`.
         max_skip: a failed neighbour is bridged over at most this many frames.
     """
 
     retrieval: RetrievalOptions = field(default_factory=RetrievalOptions)
+    predicted: PredictedOptions = field(default_factory=PredictedOptions)
     max_skip: int = 3
 
 

@@ -85,7 +85,7 @@ def fused_of(robots, edges, turned=(), repetition=0.1, bundled=None):
     repeats = repetition if isinstance(repetition, dict) else dict.fromkeys(frames, repetition)
     second = {f: repeats.get(f, 0.0) for f in frames}
     reused = Reused(0, len(frames), 0, len(edges) + len(turned))
-    front_end = FrontEndResult(tuple(edges), tuple(turned), second, {}, reused, b"")
+    front_end = FrontEndResult(tuple(edges), tuple(turned), second, {}, reused, 0, b"")
     every = (*edges, *odometry_edges(robots))
     alone = {r.name: robot_estimate(r.name, frames, every) for r in robots}
     return Fused(robots, robots, front_end, every, alone, fuse(frames, every), bundled)

@@ -221,3 +221,28 @@ def test_no_bundle_where_none_is_wanted_or_none_is_possible():
     refused = fuse_robots(one, options, 1, silent, Stopwatch()).bundled
     assert isinstance(refused, BundleRefusal)
     assert refused.reason is Illposed.NO_POINTS
+
+
+def test_a_second_round_tries_what_the_poses_say_and_retrieval_did_not():
+    """Retrieval names one frame each; every view shares floor with some that it did not name."""
+    few = ("front_end.pairs.retrieval.num_frames=1", "front_end.pairs.retrieval.num_others=1")
+    robots = read_team(painted_pair(), ["A", "B"])
+    found = {}
+    for rounds, most in (("one", 0), ("two", 3)):
+        second = (
+            f"front_end.pairs.predicted.num_frames={most}",
+            "front_end.pairs.predicted.least_pairs=6",
+            "front_end.pairs.predicted.least_overlap=0.25",
+        )
+        options = with_settings(RunOptions(), (*QUICK, *few, *second))
+        found[rounds] = fuse_robots(robots, options, 2, silent, Stopwatch(), bundled=False)
+    one, two = (
+        {(e.a, e.b): e.a_from_b for e in found[rounds].front_end.edges} for rounds in ("one", "two")
+    )
+    assert found["one"].front_end.num_further == 0
+    assert found["two"].front_end.num_further > 0
+    assert set(one) < set(two)
+    assert all(two[pair] == motion for pair, motion in one.items())
+    assert list(two) == sorted(two)
+    assert len(found["two"].edges) == len(found["two"].team.verdicts) == len(two)
+    assert found["one"].key != found["two"].key

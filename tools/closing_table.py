@@ -109,6 +109,9 @@ def _pair_lines(fused: Fused) -> list[str]:
     tried = len(accepted) + len(rejected)
     head = f"pairs tried {tried}: accepted {len(accepted)} ({between} between robots)"
     lines = [f"{head}, rejected {len(rejected)}"]
+    further = fused.front_end.num_further
+    if further:
+        lines.append(f"  {further} of them where poses told of shared floor and the graph was weak")
     down = turned_down(fused.team)
     reasons = Counter(r.reason.value for r in rejected)
     reasons.update(f"{r.reason.value} in the graph" for r in down)

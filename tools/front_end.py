@@ -1,6 +1,7 @@
 """Run the front-end over a team: features of every frame, then every pair that is worth a try.
 
-What the store knows already is not done again.
+A second round tries views that share floor by what their poses say, where the graph is weak. What
+the store knows already is not done again.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -51,6 +52,7 @@ class FrontEndResult:
         repetition: of every frame's floor; see `frontend/repetition.py`.
         pictures: digest of every frame's file.
         reused: what the store knew.
+        num_further: pairs of the second round.
         key: digest of all that this depends on.
     """
 
@@ -59,7 +61,87 @@ class FrontEndResult:
     repetition: dict[FrameId, float]
     pictures: dict[FrameId, bytes]
     reused: Reused
+    num_further: int
     key: bytes
+
+
+class FrontEnd:
+    """The front-end at work: a first round at once, others when they are asked for.
+
+    Args:
+        robots: the team.
+        options: see there.
+        workers: do the work.
+        store: what is known.
+        progress: shows how far it is.
+        stage: takes the time of each stage.
+
+    Raises:
+        DataError: a picture can't be read, or the store can't be written.
+    """
+
+    def __init__(
+        self,
+        robots: Sequence[Robot],
+        options: FrontEndOptions,
+        workers: Workers,
+        store: Store,
+        progress: Progress,
+        stage: Stage,
+    ) -> None:
+        options = comparable(options, robots)
+        placed = [(robot, frame) for robot in robots for frame in robot.frames]
+        with stage("features"):
+            jobs = list(in_threads(lambda rf: look_job(*rf, options), placed, READERS))
+            shelf = Shelf(store, {job.key: job for job in jobs}, options)
+            self._num_looks = _look(jobs, shelf, workers, options, store, progress)
+            self._repetition = {job.frame.id: _repetition(job, shelf, store) for job in jobs}
+        self._pictures = {job.frame.id: job.picture for job in jobs}
+        spots = {
+            job.frame.id: Spot(job.frame, robot, job.key)
+            for (robot, _), job in zip(placed, jobs, strict=True)
+        }
+        self._stage = stage
+        self._order = sorted(spots)
+        self._tried = _Pairs(spots, shelf, workers, options, store, progress)
+        self._num_further = 0
+        with stage("retrieval"):
+            similar = _similar(self._order, spots, shelf, options, store)
+        with stage("pairs"):
+            self._tried.add([*neighbour_pairs(self._order), *similar], "pairs")
+            for skip in range(2, options.pairs.max_skip + 1):
+                further = skip_pairs(self._order, self._tried.joined(), skip)
+                self._tried.add(further, f"bridging {skip}")
+
+    @property
+    def tried(self) -> set[Pair]:
+        """All pairs that were tried."""
+        return set(self._tried.found)
+
+    def try_further(self, pairs: Sequence[Pair]) -> None:
+        """Try pairs of a second round.
+
+        Raises:
+            DataError: the store can't be written.
+        """
+        before = len(self._tried.found)
+        with self._stage("pairs"):
+            self._tried.add(pairs, "second round")
+        self._num_further += len(self._tried.found) - before
+
+    def result(self) -> FrontEndResult:
+        """Return what was found so far."""
+        tried = self._tried
+        outcome = [tried.found[pair] for pair in sorted(tried.found)]
+        return FrontEndResult(
+            tuple(found for found in outcome if isinstance(found, RelativePose)),
+            tuple(found for found in outcome if isinstance(found, Rejected)),
+            self._repetition,
+            self._pictures,
+            Reused(self._num_looks, len(self._order), tried.num_known, len(tried.found)),
+            self._num_further,
+            key_of("front end", sorted(tried.keys.items()), self._order),
+        )
 
 
 def run_front_end(
@@ -75,34 +157,7 @@ def run_front_end(
     Raises:
         DataError: a picture can't be read, or the store can't be written.
     """
-    options = comparable(options, robots)
-    placed = [(robot, frame) for robot in robots for frame in robot.frames]
-    with stage("features"):
-        jobs = list(in_threads(lambda rf: look_job(*rf, options), placed, READERS))
-        shelf = Shelf(store, {job.key: job for job in jobs}, options)
-        num_looks = _look(jobs, shelf, workers, options, store, progress)
-        repetition = {job.frame.id: _repetition(job, shelf, store) for job in jobs}
-    spots = {
-        job.frame.id: Spot(job.frame, robot, job.key)
-        for (robot, _), job in zip(placed, jobs, strict=True)
-    }
-    tried = _Pairs(spots, shelf, workers, options, store, progress)
-    order = sorted(spots)
-    with stage("retrieval"):
-        similar = _similar(order, spots, shelf, options, store)
-    with stage("pairs"):
-        tried.add([*neighbour_pairs(order), *similar], "pairs")
-        for skip in range(2, options.pairs.max_skip + 1):
-            tried.add(skip_pairs(order, tried.joined(), skip), f"bridging {skip}")
-    outcome = [tried.found[pair] for pair in sorted(tried.found)]
-    return FrontEndResult(
-        tuple(found for found in outcome if isinstance(found, RelativePose)),
-        tuple(found for found in outcome if isinstance(found, Rejected)),
-        repetition,
-        {job.frame.id: job.picture for job in jobs},
-        Reused(num_looks, len(jobs), tried.num_known, len(tried.found)),
-        key_of("front end", sorted(tried.keys.items()), order),
-    )
+    return FrontEnd(robots, options, workers, store, progress, stage).result()
 
 
 def _look(

@@ -26,10 +26,11 @@ from groundfuse.backend.measurement import (
     TeamEstimate,
 )
 from groundfuse.backend.team import TeamOptions, fuse
+from groundfuse.frontend.predicted import Pair, floor_outline, predicted_pairs
 from groundfuse.frontend.repetition import REPEATS
 from groundfuse.tools.code_version import code_of
 from groundfuse.tools.focal_gain import focal_gains
-from groundfuse.tools.front_end import FrontEndResult, run_front_end
+from groundfuse.tools.front_end import FrontEnd, FrontEndResult
 from groundfuse.tools.front_end_options import FrontEndOptions
 from groundfuse.tools.packing import key_of
 from groundfuse.tools.robot import Frame, Robot
@@ -188,32 +189,78 @@ def _looked(
 ) -> Fused:
     """Match with these cameras, which are `mounts` off the files, and fuse."""
     store, watch = means.store, means.watch
-    found = run_front_end(
-        cameras, options.front_end, means.workers, store, means.progress, watch.stage
-    )
-    edges = (*found.edges, *odometry_edges(robots))
-    frames = [frame.id for robot in robots for frame in robot.frames]
-    code = code_of("groundfuse.tools.pipeline", rooms=("frontend", "backend", "tools"))
-    rests_on: tuple[object, ...] = (code, found.key, frames, _odometry(robots), options.team)
+    front = FrontEnd(cameras, options.front_end, means.workers, store, means.progress, watch.stage)
+    graphs = _graphs(robots, front.result(), options, means)
+    further = _further_pairs(cameras, front.tried, graphs, options.front_end, means)
+    if further:
+        front.try_further(further)
+        graphs = _graphs(robots, front.result(), options, means)
+    team, edges, rests_on = graphs.team, graphs.edges, graphs.rests_on
     known = [(r.camera, [(f.attitude, f.sigma) for f in r.frames]) for r in robots]
-
-    def graphs() -> tuple[dict[str, RobotEstimate], TeamEstimate]:
-        alone = {r.name: robot_estimate(r.name, frames, edges, options.team) for r in robots}
-        return alone, fuse(frames, edges, options.team)
 
     def refine() -> BundleEstimate | BundleRefusal:
         accepted = as_filed(accepted_edges(team, edges), robots, mounts)
         return _bundled(robots, team, accepted, options.bundle)
 
-    with watch.stage("graphs"):
-        alone, team = store.kept("graphs", "team", rests_on, graphs)
     refined: BundleEstimate | BundleRefusal | None = None
     if bundled:
         rests_on = (*rests_on, known, mounts, options.bundle)
         with watch.stage("bundle"):
             refined = store.kept("bundle", "team", rests_on, refine)
     key = key_of("fused", rests_on, known)
-    return Fused(robots, cameras, found, edges, alone, team, refined, key)
+    return Fused(robots, cameras, front.result(), edges, graphs.alone, team, refined, key)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Graphs:
+    """The robots' graphs and the team's, and all that they depend on."""
+
+    edges: tuple[RelativePose, ...]
+    alone: dict[str, RobotEstimate]
+    team: TeamEstimate
+    rests_on: tuple[object, ...]
+
+
+def _graphs(
+    robots: Sequence[Robot], found: FrontEndResult, options: PipelineOptions, means: Means
+) -> _Graphs:
+    """Optimise every robot by itself, and fuse."""
+    edges = (*found.edges, *odometry_edges(robots))
+    frames = [frame.id for robot in robots for frame in robot.frames]
+    code = code_of("groundfuse.tools.pipeline", rooms=("frontend", "backend", "tools"))
+    rests_on: tuple[object, ...] = (code, found.key, frames, _odometry(robots), options.team)
+
+    def solve() -> tuple[dict[str, RobotEstimate], TeamEstimate]:
+        alone = {r.name: robot_estimate(r.name, frames, edges, options.team) for r in robots}
+        return alone, fuse(frames, edges, options.team)
+
+    with means.watch.stage("graphs"):
+        alone, team = means.store.kept("graphs", "team", rests_on, solve)
+    return _Graphs(edges, alone, team, rests_on)
+
+
+def _further_pairs(
+    robots: Sequence[Robot],
+    tried: set[Pair],
+    graphs: _Graphs,
+    options: FrontEndOptions,
+    means: Means,
+) -> list[Pair]:
+    """Return the pairs that the poses found so far say are worth a try."""
+    chosen = options.pairs.predicted
+    if chosen.num_frames == 0:
+        return []
+    team, placed = graphs.team, {f.id: (r.camera, f) for r in robots for f in r.frames}
+    with means.watch.stage("retrieval"):
+        outlines = {}
+        for frame, pose in team.team_from_base.items():
+            camera, seen = placed[frame]
+            team_from_foot = pose @ camera.mount.base_from_foot
+            outlines[frame] = floor_outline(
+                camera, seen.attitude, team_from_foot, options.features.overhead
+            )
+        accepted = [(edge.a, edge.b) for edge in accepted_edges(team, graphs.edges)]
+        return predicted_pairs(outlines, team.component_of, accepted, tried, chosen)
 
 
 def _odometry(robots: Sequence[Robot]) -> list[tuple[Se2, Se2] | None]:
