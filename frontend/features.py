@@ -139,7 +139,8 @@ def _found(normalised: Picture32, mask: Mask, wanted: int, options: FeatureOptio
     if options.kind == "sift":
         return blobs(normalised, inner, wanted, options.contrast_threshold, options.cell_px)
     flat = np.clip(128.0 + options.contrast_gain_grey * normalised, 0, 255).astype(np.uint8)
-    return corners(flat, inner, wanted, options.cell_px)
+    # An arc that differs by less than a local standard deviation is hardly ever among the best.
+    return corners(flat, inner, wanted, options.contrast_gain_grey, options.cell_px)
 
 
 def _sigma(

@@ -98,9 +98,17 @@ def _described(
     return index[order], np.concatenate(angles)[order], np.concatenate(rows)[order]
 
 
-def corners(flat: Image, inner: Mask, wanted: int, cell_px: int) -> Keypoints:
-    """Return the corners of a view in grey values, described by ORB's bits (n, 32) uint8."""
-    orb = cv2.ORB.create(nfeatures=4 * wanted + 1, fastThreshold=10, nlevels=4)
+def corners(flat: Image, inner: Mask, wanted: int, least_grey: float, cell_px: int) -> Keypoints:
+    """Return the corners of a view in grey values, described by ORB's bits (n, 32) uint8.
+
+    Args:
+        flat: (rows, columns) view after local contrast normalisation.
+        inner: (rows, columns) where corners may lie.
+        wanted: most that are returned.
+        least_grey: grey values by which a corner's arc differs at least.
+        cell_px: side of the cells over which they are spread.
+    """
+    orb = cv2.ORB.create(nfeatures=2 * wanted + 1, fastThreshold=round(least_grey), nlevels=4)
     many = orb.detect(flat, inner.astype(np.uint8))
     points = np.array([k.pt for k in many], dtype=np.float64).reshape(-1, 2)
     strength = np.array([k.response for k in many], dtype=np.float64)
