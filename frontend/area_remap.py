@@ -5,7 +5,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from groundfuse.frontend.area_compiled import PART_BITS, fill_means
 from groundfuse.frontend.arrays import Floats, Image, Mask, Picture32
 
 MAX_SUPERSAMPLING = 8
@@ -15,6 +17,8 @@ JACOBIAN_STEP = 4
 """The scale of the picture is looked at in every fourth cell of every fourth row."""
 OUTSIDE_PX = -1e4
 """Stands for a cell without a place in the picture, which remap cannot take as nan."""
+REMAPPED = 30_000
+"""Cells per call of remap, which takes no picture of 32767 px or more."""
 MEAN_TO_POINT = np.array([-1.0, 26.0, -1.0], dtype=np.float32) / np.float32(24.0)
 """A pixel is the mean m of the light over its square; the light at its middle is m - m'' / 24 to
 fourth order, along each axis (the finite-volume methods' rule)."""
@@ -28,35 +32,53 @@ def singular_values(by_u: Floats, by_v: Floats) -> tuple[Floats, Floats]:
 
 
 class AreaPlan(NamedTuple):
-    """Where each cell of an output picture reads, worked out once for many pictures.
+    """Where each wanted cell of an output picture reads, worked out once for many pictures.
 
     Attributes:
         level: halvings of the picture that lose nothing.
         samples: samples per side of a cell.
-        map_u: (rows * samples, columns * samples) picture columns at that level.
-        map_v: the same for rows.
+        cells: (n, 2) uint32 rows and columns of the wanted cells.
+        places: (n, samples ** 2, 2) float32 picture columns and rows at that level.
+        starts: (n, samples ** 2) uint32 first of the four pixels around a place; see `fill_means`.
+        parts: (n, samples ** 2, 2) uint16 place behind it, 1 / 2 ** PART_BITS px.
     """
 
     level: int
     samples: int
-    map_u: Picture32
-    map_v: Picture32
+    cells: NDArray[np.uint32]
+    places: Picture32
+    starts: NDArray[np.uint32]
+    parts: NDArray[np.uint16]
 
 
-def area_plan(source_px: Floats, wanted: Mask) -> AreaPlan:
+def area_plan(source_px: Floats, wanted: Mask, size_px: tuple[int, int]) -> AreaPlan:
     """Plan the reading of cells.
 
     Args:
         source_px: (rows + 2, columns + 2, 2) picture coordinates of the cells' centres, with a
             margin of one cell; nan where a cell has none.
-        wanted: (rows, columns) cells that matter; the others hold anything.
+        wanted: (rows, columns) cells that matter; the others are not read.
+        size_px: columns and rows of the picture, at least two.
     """
     level, samples = _level_and_factor(source_px, wanted)
+    level = min(level, int(math.log2(min(size_px) - 1)))
     maps = np.nan_to_num(source_px / 2.0**level, nan=OUTSIDE_PX).astype(np.float32)
     fine = cv2.resize(maps, None, fx=samples, fy=samples, interpolation=cv2.INTER_LINEAR)
     inner = np.asarray(fine, dtype=np.float32)[samples:-samples, samples:-samples]
-    map_u, map_v = (np.ascontiguousarray(inner[..., axis]) for axis in (0, 1))
-    return AreaPlan(level, samples, map_u, map_v)
+    rows, columns = wanted.shape
+    blocks = inner.reshape(rows, samples, columns, samples, 2).swapaxes(1, 2)
+    places = blocks[wanted].reshape(-1, samples**2, 2)
+    cells = np.argwhere(wanted).astype(np.uint32)
+    if samples == 1:
+        nothing = np.zeros((0, 1), np.uint32), np.zeros((0, 1, 2), np.uint16)
+        return AreaPlan(level, samples, cells, places, *nothing)
+    last = np.array([-(-side // 2**level) - 1 for side in size_px])
+    whole = np.rint(places * np.float32(2**PART_BITS)).astype(np.int64)
+    whole = np.clip(whole, 0, last << PART_BITS)  # beyond its border the picture goes on
+    first = np.minimum(whole >> PART_BITS, last - 1)
+    starts = (first[..., 1] * (last[0] + 1) + first[..., 0]).astype(np.uint32)
+    parts = (whole - (first << PART_BITS)).astype(np.uint16)
+    return AreaPlan(level, samples, cells, places[:0], starts, parts)
 
 
 def point_values(image: Image) -> Image:
@@ -72,7 +94,7 @@ def point_values(image: Image) -> Image:
     return np.asarray(points, dtype=image.dtype)
 
 
-def area_read(pyramid: list[Image], plan: AreaPlan) -> Image:
+def area_read(pyramid: list[Image], plan: AreaPlan, view: Image) -> None:
     """Average the picture over each cell: the pyramid level that loses nothing, supersampled.
 
     Where the picture is coarser than the cells it is interpolated (bicubic).
@@ -80,26 +102,25 @@ def area_read(pyramid: list[Image], plan: AreaPlan) -> Image:
     Args:
         pyramid: the picture, then halvings of it; grows where more are needed.
         plan: where each cell reads.
+        view: (rows, columns, ...) output picture; only the planned cells are written.
     """
-    interpolation = cv2.INTER_CUBIC if plan.samples == 1 else cv2.INTER_LINEAR
     picture = _level(pyramid, plan)
-    sampled = cv2.remap(
-        picture, plan.map_u, plan.map_v, interpolation, borderMode=cv2.BORDER_REPLICATE
-    )
-    return _cell_means(np.asarray(sampled, dtype=picture.dtype), plan)
+    if plan.samples > 1:
+        shape = picture.shape[1], math.prod(picture.shape[2:])
+        deep = view.reshape(*view.shape[:2], shape[1])
+        fill_means(picture.reshape(-1), shape, plan.starts, plan.parts, plan.cells, deep)
+        return
+    for first in range(0, len(plan.cells), REMAPPED):
+        some = slice(first, first + REMAPPED)
+        u, v = (np.ascontiguousarray(plan.places[some, :, axis]) for axis in (0, 1))
+        read = cv2.remap(picture, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        view[plan.cells[some, 0], plan.cells[some, 1]] = np.asarray(read)[:, 0]
 
 
 def _level(pyramid: list[Image], plan: AreaPlan) -> Image:
     while len(pyramid) <= plan.level:
         pyramid.append(np.asarray(cv2.pyrDown(pyramid[-1]), dtype=pyramid[0].dtype))
     return pyramid[plan.level]
-
-
-def _cell_means(sampled: Image, plan: AreaPlan) -> Image:
-    rows, columns = plan.map_u.shape
-    size = (columns // plan.samples, rows // plan.samples)
-    averaged = cv2.resize(sampled, size, interpolation=cv2.INTER_AREA)
-    return np.asarray(averaged, dtype=sampled.dtype)
 
 
 def _level_and_factor(source_px: Floats, wanted: Mask) -> tuple[int, int]:

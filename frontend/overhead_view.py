@@ -147,8 +147,7 @@ def overhead_view(
     mask = np.zeros((grid.height_px, grid.width_px), dtype=np.bool_)
     pyramid = [image]
     for rows, columns, seen, plan in _planned_tiles(camera, attitude, grid):
-        view[rows, columns] = area_read(pyramid, plan)
-        view[rows, columns][~seen] = 0
+        area_read(pyramid, plan, view[rows, columns])
         mask[rows, columns] = seen
     return view, mask
 
@@ -159,12 +158,13 @@ def _planned_tiles(
 ) -> tuple[tuple[slice, slice, Mask, AreaPlan], ...]:
     """Tiles with floor and where they read; most frames of a robot share camera and attitude."""
     widest = _widest_ray(camera)
+    size_px = camera.intrinsics.width_px, camera.intrinsics.height_px
     planned = []
     for rows, columns in _tiles(grid):
         source_px = _source_px(camera, attitude, grid, (rows, columns), widest)
         seen = _seen(source_px[1:-1, 1:-1], camera) & _near(grid, rows, columns)
         if seen.any():
-            planned.append((rows, columns, seen, area_plan(source_px, seen)))
+            planned.append((rows, columns, seen, area_plan(source_px, seen, size_px)))
     return tuple(planned)
 
 

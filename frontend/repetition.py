@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from groundfuse.frontend.arrays import Mask, Picture32
+from groundfuse.frontend.repetition_compiled import best_shift
 
 REPEATS = 0.5
 """A second peak above this marks a floor as repeating."""
@@ -28,13 +29,11 @@ def _spectrum(picture: Picture32) -> Picture32:
     return np.asarray(cv2.dft(padded), dtype=np.float32)
 
 
-def _correlated(one: Picture32, two: Picture32, shape: tuple[int, ...]) -> Picture32:
-    """Return sums of products at all shifts, none in the middle, of two spectra of pictures."""
+def _correlated(one: Picture32, two: Picture32) -> Picture32:
+    """Return sums of products at all shifts, none in the corner, of two spectra of pictures."""
     product = cv2.mulSpectrums(one, two, 0, conjB=True)
     sums = cv2.idft(product, flags=cv2.DFT_SCALE | cv2.DFT_REAL_OUTPUT)
-    before = [side - 1 for side in shape]
-    rolled = np.roll(np.asarray(sums, dtype=np.float32), before, axis=(0, 1))
-    return rolled[: 2 * shape[0] - 1, : 2 * shape[1] - 1]
+    return np.asarray(sums, dtype=np.float32)
 
 
 def repetition(normalised: Picture32, mask: Mask) -> float:
@@ -54,16 +53,7 @@ def repetition(normalised: Picture32, mask: Mask) -> float:
     shrunk = cv2.resize(normalised, size, interpolation=cv2.INTER_AREA)
     value = np.asarray(np.asarray(shrunk) * weight, dtype=np.float32)
     of_value, of_square, of_weight = (_spectrum(p) for p in (value, value * value, weight))
-    product = _correlated(of_value, of_value, value.shape)
-    power = _correlated(of_square, of_weight, value.shape)
-    norm = np.sqrt(np.maximum(power * power[::-1, ::-1], 0.0))
-    overlap = _correlated(of_weight, of_weight, value.shape)
-    rows, columns = product.shape
-    away = np.hypot(
-        *np.ogrid[-(rows // 2) : rows - rows // 2, -(columns // 2) : columns - columns // 2]
-    )
-    counted = (overlap > MIN_OVERLAP * weight.sum()) & (away > MAIN_LOBE_SHARE * max(size))
-    counted &= norm > FAINTEST**2 * overlap
-    if not counted.any():
-        return 0.0
-    return float(np.clip((product[counted] / norm[counted]).max(), 0.0, 1.0))
+    product, overlap = _correlated(of_value, of_value), _correlated(of_weight, of_weight)
+    power = _correlated(of_square, of_weight)
+    limits = MIN_OVERLAP * float(weight.sum()), MAIN_LOBE_SHARE * max(size), FAINTEST**2
+    return float(best_shift(product, power, overlap, value.shape, limits))
