@@ -97,6 +97,77 @@ def _taken_steps(out: Any, step: Any, frame_start: Any, point: Any, rest: Any) -
                     rest[point[s], k] -= step[frame, i] * out[i, s, k]
 
 
+def _residuals(
+    sightings: tuple[Any, Any, Any, Any],
+    frames: tuple[Any, Any, Any],
+    points: Any,  # noqa: ANN401
+    near: float,
+    residual: Any,  # noqa: ANN401
+    unseen: Any,  # noqa: ANN401
+) -> None:
+    """Compare rays with where their floor points appear; see `bundle_model`.
+
+    Args:
+        sightings: frame and point (n,), ray (n, 2) and the focal length's gain (n,).
+        frames: poses (frames, 3), attitudes (frames, 3), lens corrections (frames, 2).
+        points: (points, 3).
+        near: least depth in heights.
+        residual: (n, 2) measured minus predicted, written.
+        unseen: (n,) whether a point is behind its camera, written.
+    """
+    frame_of, point_of, ray, gain = sightings
+    poses, attitudes, lenses = frames
+    known = -1
+    for s in range(len(frame_of)):
+        f = frame_of[s]
+        if f != known:  # sightings come frame by frame
+            known = f
+            turn_c, turn_s = np.cos(poses[f, 2]), np.sin(poses[f, 2])
+            tilt_c, tilt_s = np.cos(attitudes[f, 0]), np.sin(attitudes[f, 0])
+            roll_c, roll_s = np.cos(attitudes[f, 1]), np.sin(attitudes[f, 1])
+        p = point_of[s]
+        dx, dy = points[p, 0] - poses[f, 0], points[p, 1] - poses[f, 1]
+        height = attitudes[f, 2] - points[p, 2]
+        qx, qy = turn_c * dx + turn_s * dy, turn_c * dy - turn_s * dx
+        leaning = roll_s * qy + roll_c * height
+        depth = tilt_s * qx + tilt_c * leaning
+        unseen[s] = not depth > near * height
+        if unseen[s]:
+            residual[s, 0] = residual[s, 1] = 0.0
+            continue
+        x, y = (roll_s * height - roll_c * qy) / depth, (tilt_s * leaning - tilt_c * qx) / depth
+        factor = (1.0 + lenses[f, 0] * gain[s]) * (1.0 + lenses[f, 1] * (x * x + y * y))
+        residual[s, 0], residual[s, 1] = ray[s, 0] - factor * x, ray[s, 1] - factor * y
+
+
+def _meeting_chi2(
+    ends: tuple[Any, Any],
+    landing: tuple[Any, Any, Any],
+    relief_m: Any,  # noqa: ANN401
+    chi2: Any,  # noqa: ANN401
+) -> None:
+    """Squared distances on the floor over their variance; inf where a ray meets no floor.
+
+    Args:
+        ends: sightings (n,) of both ends of each correspondence.
+        landing: points (m, 2), covariances (m, 2, 2), ways per height (m, 2) of the sightings.
+        relief_m: (m,) deviation of the floor's heights where each sighting is; 0 if flat.
+        chi2: (n,) written.
+    """
+    one, other = ends
+    point, spread, slope = landing
+    for n in range(len(one)):
+        a, b = one[n], other[n]
+        x, y = point[a, 0] - point[b, 0], point[a, 1] - point[b, 1]
+        px = relief_m[a] * (slope[a, 0] - slope[b, 0])
+        py = relief_m[a] * (slope[a, 1] - slope[b, 1])
+        xx = spread[a, 0, 0] + spread[b, 0, 0] + px * px
+        xy = spread[a, 0, 1] + spread[b, 0, 1] + px * py
+        yy = spread[a, 1, 1] + spread[b, 1, 1] + py * py
+        found = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
+        chi2[n] = found if np.isfinite(found) else np.inf
+
+
 def _assemble(
     blocks: Any,  # noqa: ANN401
     entry: Any,  # noqa: ANN401
@@ -129,10 +200,12 @@ def _add_update(dense: Any, update: Any, place: Any) -> None:  # noqa: ANN401
             dense[place[i], place[j]] += update[i, j]
 
 
-_compiled: Any = njit(cache=True, nogil=True)
+_compiled: Any = njit(cache=True, nogil=True, error_model="numpy")
 frame_blocks: Any = _compiled(_frame_blocks)
 pair_blocks: Any = _compiled(_pair_blocks)
 right_sums: Any = _compiled(_right_sums)
 taken_steps: Any = _compiled(_taken_steps)
+residuals_of: Any = _compiled(_residuals)
+meeting_chi2: Any = _compiled(_meeting_chi2)
 assemble: Any = _compiled(_assemble)
 add_update: Any = _compiled(_add_update)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from groundfuse.backend.bundle_compiled import meeting_chi2
 from groundfuse.backend.bundle_estimate import BundleOptions
 from groundfuse.backend.bundle_model import State, floor_points
 from groundfuse.backend.bundle_priors import Priors
@@ -42,16 +43,10 @@ def link_chi2(
     landing = floor_points(sightings.frame, sightings.ray, sightings.gain, state, priors.robot_of)
     spread = landing.by_ray @ landing.by_ray.transpose(0, 2, 1)
     spread *= ((noise * sightings.sigma) ** 2)[:, None, None]
-    apart = landing.point[links.a] - landing.point[links.b]
-    total = spread[links.a] + spread[links.b]
-    if priors.relief > 0.0:
-        height = state.attitude[sightings.frame[links.a], 2][:, None]
-        parallax = priors.relief * height * (landing.slope[links.a] - landing.slope[links.b])
-        total += parallax[:, :, None] * parallax[:, None, :]
-    xx, xy, yy = total[:, 0, 0], total[:, 0, 1], total[:, 1, 1]
-    chi2 = yy * apart[:, 0] ** 2 - 2.0 * xy * apart[:, 0] * apart[:, 1] + xx * apart[:, 1] ** 2
-    found = chi2 / (xx * yy - xy * xy)
-    return np.where(np.isfinite(found), found, np.inf)
+    relief_m = priors.relief * state.attitude[sightings.frame, 2]
+    chi2 = np.empty(len(links))
+    meeting_chi2((links.a, links.b), (landing.point, spread, landing.slope), relief_m, chi2)
+    return chi2
 
 
 def cut(

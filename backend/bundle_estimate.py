@@ -1,10 +1,10 @@
 """What the planar bundle is asked and what it answers: frozen values, numpy only."""
 
-import math
 from dataclasses import dataclass
 from enum import StrEnum
 
 from groundfuse.backend.measurement import Attitude, FrameId, Rejected, Se2, TeamEstimate
+from groundfuse.backend.option_checks import check_numbers
 
 FocalGains = tuple[tuple[float, float], ...]
 
@@ -64,25 +64,9 @@ class BundleOptions:
     """A calibration number is stated where its sigma is below this share of the prior's."""
 
     def __post_init__(self) -> None:
-        """Refuse sigmas and counts that are not positive (ValueError)."""
-        for name in (
-            "mount_tilt_sigma_deg",
-            "mount_roll_sigma_deg",
-            "mount_height_sigma",
-            "focal_sigma",
-            "distortion_sigma",
-            "file_gate_sigma",
-            "most_sightings",
-            "trial_sightings",
-            "start_sightings",
-            "robust_sigma",
-            "link_gate_sigma",
-            "min_links",
-            "iterations",
-        ):
-            value = getattr(self, name)
-            if not (value > 0 and math.isfinite(value)):
-                raise ValueError(f"{name} must be positive, got {value:g}")
+        """Refuse numbers that make no sense (ValueError)."""
+        shares = ("min_link_share", "observed_share")
+        check_numbers(self, may_be_zero=shares, shares=shares)
         if not self.relief_levels or not all(0.0 < level < 1.0 for level in self.relief_levels):
             found = ", ".join(f"{level:g}" for level in self.relief_levels) or "none"
             raise ValueError(f"relief_levels must lie between 0 and 1, got {found}")

@@ -34,7 +34,6 @@ class Errors:
 def errors_of(seen: Observations, state: State, robot_of: Integers) -> Errors:
     """Compare all sightings with the model."""
     residual, unseen = residuals(seen, state, robot_of)
-    residual[unseen] = 0.0
     chi2 = (residual[:, 0] ** 2 + residual[:, 1] ** 2) / seen.sigma**2
     return Errors(residual, unseen, chi2)
 

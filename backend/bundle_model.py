@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from groundfuse.backend.bundle_compiled import residuals_of
 from groundfuse.backend.bundle_tracks import Integers, Observations
 
 Array = NDArray[np.float64]
@@ -105,18 +106,12 @@ def view_of(seen: Observations, state: State, part: slice) -> View:
 def residuals(seen: Observations, state: State, robot_of: Integers) -> tuple[Array, Mask]:
     """Measured minus predicted rays (n, 2), and whether a point is behind its camera (n,).
 
-    The residual of such a point means nothing.
+    The residual of such a point is 0.
     """
     result, unseen = np.empty((len(seen.frame), 2)), np.empty(len(seen.frame), dtype=np.bool_)
-    for part in seen.parts:
-        view = view_of(seen, state, part)
-        shared = state.shared[robot_of[seen.frame[part]]]
-        factor = (1.0 + shared[:, 3] * seen.gain[part]) * (
-            1.0 + shared[:, 4] * (view.x**2 + view.y**2)
-        )
-        result[part, 0] = seen.ray[part, 0] - factor * view.x
-        result[part, 1] = seen.ray[part, 1] - factor * view.y
-        unseen[part] = view.per_depth == 0.0
+    sightings = seen.frame, seen.point, seen.ray, seen.gain
+    frames = state.pose, state.attitude, np.ascontiguousarray(state.shared[robot_of, 3:5])
+    residuals_of(sightings, frames, state.point, NEAR, result, unseen)
     return result, unseen
 
 

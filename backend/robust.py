@@ -15,6 +15,7 @@ from groundfuse.backend import planar, sparse
 from groundfuse.backend.chain import spanning_forest
 from groundfuse.backend.consistency import Flags
 from groundfuse.backend.initial import chordal, layout_of
+from groundfuse.backend.option_checks import check_numbers
 from groundfuse.backend.problem import Array, Problem, chi2, chi2_per_edge, components, residuals
 from groundfuse.backend.solver import SolverOptions, gauss_newton_step, minimise
 
@@ -39,6 +40,12 @@ class RobustOptions:
     growth: float = 2.0
     max_rounds: int = 60
     max_passes: int = 5
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that make no sense (ValueError)."""
+        check_numbers(self)
+        if self.growth <= 1.0:
+            raise ValueError(f"growth must be above 1, got {self.growth:g}")
 
 
 class Robust(NamedTuple):

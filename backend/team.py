@@ -16,6 +16,7 @@ from groundfuse.backend.doubt import doubtful_steps
 from groundfuse.backend.initial import held_poses, layout_of
 from groundfuse.backend.measurement import FrameId, RelativePose, TeamEstimate
 from groundfuse.backend.numbering import Team, team_of
+from groundfuse.backend.option_checks import check_numbers
 from groundfuse.backend.problem import Array, Indices, Problem
 from groundfuse.backend.report import Findings, estimate
 from groundfuse.backend.robust import RobustOptions, settle
@@ -48,6 +49,10 @@ class TeamOptions:
     step_trust: float = 2.0
     rival_trust: float = 2.5
     refine_below: int = 20_000
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that make no sense (ValueError)."""
+        check_numbers(self, may_be_zero=("max_cuts", "max_trials", "rival_trust", "refine_below"))
 
 
 DEFAULTS = TeamOptions()

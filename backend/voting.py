@@ -19,6 +19,7 @@ from groundfuse.backend.chance import coincidence, expected_sets
 from groundfuse.backend.consistency import Flags, links
 from groundfuse.backend.cycles import Cycle, closed_cycles
 from groundfuse.backend.hypotheses import MAX_PER_PAIR, Hypothesis, hypotheses
+from groundfuse.backend.option_checks import check_numbers
 from groundfuse.backend.problem import Indices
 from groundfuse.backend.skeleton import Skeleton, chi2_of_joins, joined
 
@@ -44,6 +45,10 @@ class VotingOptions:
     ambiguity_ratio: float = 2.0
     max_alternatives: int = 100
     chance: float = 0.05
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that make no sense (ValueError)."""
+        check_numbers(self, may_be_zero=("max_alternatives",), shares=("chance",))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

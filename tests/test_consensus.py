@@ -85,7 +85,7 @@ def assert_near(mode, truth):
     st.integers(0, 2**16),
     st.booleans(),
 )
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 def test_the_planted_motion_is_found(truth, seed, turned):
     """One right candidate in four, with and without orientations."""
     found = planted(np.random.default_rng(seed), (truth,))
@@ -130,7 +130,7 @@ def test_every_draw_from_exact_matches_is_the_motion(scale):
 
 
 @given(st.integers(0, 2**16))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_a_draw_takes_the_candidate_that_its_weight_gives_it(seed):
     """Against bisection, shares at the very borders included."""
     rng = np.random.default_rng(seed)
@@ -332,7 +332,7 @@ def test_moving_a_view_moves_the_motion():
 
 
 @given(st.integers(0, 2**16))
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 def test_voters_are_one_to_one_and_the_nearest(seed):
     rng = np.random.default_rng(seed)
     count = 60
@@ -361,7 +361,7 @@ def test_voters_are_one_to_one_and_the_nearest(seed):
 
 
 @given(st.integers(0, 2**16), st.booleans())
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 def test_votes_are_those_of_whole_matrices(seed, scaled):
     """Every motion against every candidate at once; some without orientation."""
     rng = np.random.default_rng(seed)

@@ -179,7 +179,7 @@ def test_density_is_per_square_height_and_never_above_the_most():
 
 
 @given(st.integers(0, 2**16), st.integers(1, 80))
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 def test_few_features_are_spread_over_the_cells(seed, wanted):
     """The strongest of each cell before the second of any, and the strongest cells first."""
     rng = np.random.default_rng(seed)

@@ -34,7 +34,7 @@ EXACT = 1e-9
 
 
 @given(motions, tilts, tilts, st.integers(0, 2**16))
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 def test_exact_without_noise(truth, tilt_a_deg, tilt_b_deg, seed):
     """Any motion, any tilts, from a start centimetres and degrees away."""
     priors = prior(tilt_a_deg, 0.55, roll_deg=1.5), prior(tilt_b_deg, 0.8)
@@ -211,7 +211,7 @@ def test_swapping_the_views_inverts_the_motion(seed):
 
 
 @given(st.sampled_from([0.1, 3.0, 70.0]), st.integers(0, 2**16))
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 def test_metres_scale_with_the_height(height_m, seed):
     """The same pictures under a camera k times higher: the motion k times as long, no more."""
     k = height_m / 0.55

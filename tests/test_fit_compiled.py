@@ -37,7 +37,6 @@ def rows_of(rays_a, motion, camera_a, camera_b):
 
 
 @given(cameras, motions, cameras, st.integers(0, 2**16))
-@settings(deadline=None)
 def test_rows_are_those_of_the_shared_model(camera_a, motion, camera_b, seed):
     """Points behind a camera included; relative to the largest of a point's rows.
 

@@ -37,7 +37,7 @@ def test_random_numbers_are_uniform_and_the_same_on_every_machine():
     st.integers(-3000, 3000),
     st.integers(1, 60),
 )
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_a_part_of_a_floor_is_the_same_made_alone(name, x0, y0, size):
     whole = FLOORS[name](3, Rect(x0, y0, 80, 70))
     part = FLOORS[name](3, Rect(x0 + 20, y0 + 10, size, size))

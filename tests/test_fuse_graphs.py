@@ -396,9 +396,7 @@ def test_files_of_an_earlier_run_are_told(tmp_path, caplog):
 WORDS = ["EDGE_SE2", "EDGE2", "1e308", "-1e150", "5e-324", "1e16", "A7", "nan", "0", "-1", "{", "7"]
 
 
-@settings(
-    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(graphs(), st.data())
 def test_no_file_makes_it_fall_over(tmp_path, graph, data):
     """Whatever a file holds: a map, or one line."""

@@ -138,7 +138,7 @@ def typed(measured):
     }
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(datasets(), st.data())
 def test_a_spoiled_file_is_refused_or_wholly_read(dataset, data):
     content = json.loads(jrl.text_of(dataset))

@@ -17,7 +17,7 @@ ROW_M, STEP_M, SWING_M = 0.4, 0.26, 0.5
 
 
 @given(st.integers(1, 80), st.floats(0.3, 6.0), st.floats(0.1, 1.0), st.floats(0.0, 0.8))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_what_the_camera_sees_moves_one_step_at_a_time(num_views, length_m, row_m, swing_m):
     """No point that is `swing_m` ahead jumps: along rows it moves with the robot, on arcs less."""
     poses = mown(num_views, length_m, row_m, STEP_M, swing_m)

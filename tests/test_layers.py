@@ -7,7 +7,11 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 ROOMS = ("frontend", "backend", "tools")
-BORDER = {"groundfuse.backend.measurement", "groundfuse.backend.reprojection"}
+BORDER = {
+    "groundfuse.backend.measurement",
+    "groundfuse.backend.option_checks",
+    "groundfuse.backend.reprojection",
+}
 FOREIGN = {
     "frontend": {"gtsam", "gtsam_unstable", "open3d", "tqdm", "joblib", "yaml"},
     "backend": {"cv2", "open3d", "tqdm", "joblib", "yaml"},

@@ -25,7 +25,7 @@ def cells(num_views, num_cells, highest, seed):
     return colours, footprint, rng.uniform(0.02, 1.0, (num_views, num_cells)).astype(np.float32)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(
     st.integers(1, 20),
     st.integers(1, 2 * compiled.LANES + 3),

@@ -8,7 +8,6 @@ from groundfuse.frontend.nearest_compiled import most_similar
 
 
 @given(st.integers(0, 2**16), st.integers(1, 8), st.booleans())
-@settings(deadline=None)
 def test_the_most_similar_are_those_of_a_stable_sort(seed, count, tied):
     rng = np.random.default_rng(seed)
     shape = int(rng.integers(1, 6)), int(rng.integers(count, 40))

@@ -115,7 +115,7 @@ def test_pixels_and_metres_go_round(cell_m, corner, px):
     np.testing.assert_allclose(there_and_back, points, atol=1e-11)
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(st.floats(-0.9, 1.2), st.floats(-0.2, 0.2), st.sampled_from(sorted(LENSES)))
 def test_the_grid_covers_the_useful_floor_and_no_more(tilt, roll, lens):
     attitude = Attitude(tilt, roll, 0.55)

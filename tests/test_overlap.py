@@ -36,7 +36,7 @@ poses = st.builds(Se2, st.floats(-1, 1), st.floats(-1, 1), st.floats(-3.1, 3.1))
 
 
 @given(poses, poses, st.sampled_from([LENS, BARREL]), st.floats(0.3, 0.9))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_overlap_is_symmetric_and_moves_with_the_world(pose_a, pose_b, lens, height_m):
     a, b = view(camera(), pose_a), view(camera(45.0, height_m, lens), pose_b)
     share = true_overlap(a, b)
@@ -68,7 +68,7 @@ def test_floor_behind_the_camera_or_folded_by_the_lens_is_not_seen():
 
 
 @given(st.lists(poses, max_size=6))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_all_overlaps_are_those_of_all_pairs(places):
     """Views whose boxes do not meet are left out, and nothing else."""
     views = {FrameId("A", k): view(camera(), pose) for k, pose in enumerate(places)}

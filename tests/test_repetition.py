@@ -23,13 +23,13 @@ def tiled(period_v, period_u, seed=0, shape=(120, 160)):
 
 
 @given(st.integers(12, 60), st.integers(12, 80), st.integers(0, 2**16))
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 def test_any_period_that_fits_twice_is_found(period_v, period_u, seed):
     assert repetition(tiled(period_v, period_u, seed), WHOLE) > 0.99
 
 
 @given(st.integers(0, 2**16))
-@settings(deadline=None, max_examples=10)
+@settings(max_examples=10)
 def test_noise_does_not_repeat(seed):
     # The highest of some 2e4 correlations over 30 % of 2e4 pixels: 4.5 / sqrt(6e3) = 0.06.
     assert repetition(white(seed), WHOLE) < 0.1

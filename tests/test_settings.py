@@ -111,8 +111,9 @@ def test_every_option_of_a_run_can_be_set_by_its_name(name):
     value = found(RunOptions(), name)
     assert with_settings(RunOptions(), [f"{name}={as_text(value)}"]) == RunOptions()
     if isinstance(value, int | float) and not isinstance(value, bool):
-        changed = with_settings(RunOptions(), [f"{name}={as_text(2 * value + 1)}"])
-        assert found(changed, name) == 2 * value + 1
+        other = 2 * value or 1 if isinstance(value, int) else 0.75 * value or 1.0
+        changed = with_settings(RunOptions(), [f"{name}={as_text(other)}"])
+        assert found(changed, name) == other
         assert [n for n in NAMES if found(changed, n) != found(RunOptions(), n)] == [name]
 
 

@@ -152,7 +152,7 @@ def test_the_optimum_is_that_of_anchors_and_own_maps():
     assert np.allclose([b.x(), b.y(), b.theta()], ours, atol=SAME_M)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.randoms(use_true_random=False), st.integers(0, 20))
 def test_order_and_direction_of_edges_do_not_matter(random, seed):
     world = team(seed, frames=15, loops=3, overlaps=6, wrong_overlaps=0.34)
@@ -169,7 +169,7 @@ def test_order_and_direction_of_edges_do_not_matter(random, seed):
     assert [v.accepted for v in other.verdicts] == accepted
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(st.permutations(["A", "B", "C"]), st.integers(0, 20))
 def test_names_of_robots_do_not_matter(names, seed):
     world = team(seed, robots=3, frames=12, loops=2, overlaps=4)

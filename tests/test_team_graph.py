@@ -204,7 +204,7 @@ def written(world, key):
     return texts, truth
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 30), st.sampled_from(["symbols", "gtsam", "plain", "offset=1000"]))
 def test_a_team_survives_its_files_in_every_scheme(seed, scheme):
     world = team(seed, robots=3, frames=7, loops=1, overlaps=2)
@@ -231,7 +231,7 @@ def test_a_team_survives_its_files_in_every_scheme(seed, scheme):
     assert all(np.allclose(found[k], wanted[k], rtol=INVERSE) for k in wanted)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.integers(0, 30))
 def test_a_team_survives_jrl_with_truth_and_labels(seed):
     world = team(seed, robots=3, frames=7, loops=2, overlaps=2, wrong_loops=0.5)

@@ -15,7 +15,7 @@ from groundfuse.tools.trajectories import count_places, loop, meetings, plan_tea
 
 
 @given(st.integers(2, 60), st.floats(0.05, 30.0), st.integers(0, 999), st.integers(1, 3))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_a_loop_starts_at_the_origin_goes_in_even_steps_and_comes_back(views, step_m, seed, laps):
     poses = loop(views * laps, step_m, np.random.default_rng(seed), laps)
     assert poses[0] == IDENTITY

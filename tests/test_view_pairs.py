@@ -56,7 +56,7 @@ def test_the_stated_motion_lays_one_picture_on_the_other(height_m):
 
 
 @given(st.integers(0, 9999))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_drawn_pairs_are_as_wanted(seed):
     options = PairOptions(least_overlap=0.45, most_overlap=0.7, max_turn_rad=0.5)
     a, b = draw_views((camera(), camera(45.0)), options, np.random.default_rng(seed))
