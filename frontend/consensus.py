@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from groundfuse.backend.measurement import Se2
+from groundfuse.backend.option_checks import check_numbers
 from groundfuse.frontend.arrays import Floats, Mask, Points
 from groundfuse.frontend.consensus_draws import allowed, distinct, draw
 from groundfuse.frontend.consensus_table import Limits, Table
@@ -63,6 +64,12 @@ class ConsensusOptions:
     distinct_turn_rad: float = 0.35
     refinements: int = 3
     num_modes: int = 3
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that make no sense (ValueError)."""
+        check_numbers(self, may_be_zero=("refinements",))
+        if self.max_turn_rad > math.pi:
+            raise ValueError(f"max_turn_rad must be pi at most, got {self.max_turn_rad:g}")
 
 
 class Gate(NamedTuple):

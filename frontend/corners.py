@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from groundfuse.backend.measurement import Attitude
+from groundfuse.backend.option_checks import check_numbers
 from groundfuse.frontend.area_remap import singular_values
 from groundfuse.frontend.arrays import Floats, Image, Mask, Picture32, Points
 from groundfuse.frontend.camera import Camera
@@ -45,6 +46,10 @@ class CornerOptions:
     """Most corners of one picture."""
     sigma_ratio: float = 0.16
     """Localisation noise of a corner over the sigma it was found at."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that make no sense (ValueError)."""
+        check_numbers(self, may_be_zero=("harris_k", "min_corners"))
 
 
 class Corners(NamedTuple):

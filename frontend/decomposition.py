@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groundfuse.backend.measurement import Attitude, Se2, wrap_rad
+from groundfuse.backend.option_checks import check_numbers
 from groundfuse.frontend.arrays import Floats, Matrix
 from groundfuse.frontend.overhead import foot_from_cam
 
@@ -22,6 +23,10 @@ class DecompositionOptions:
 
     min_sin_theta: float = 0.25
     """Recover both tilts where |sin theta| is at least this; below, keep the calibrated ones."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that make no sense (ValueError)."""
+        check_numbers(self, may_be_zero=("min_sin_theta",), shares=("min_sin_theta",))
 
 
 @dataclass(frozen=True, slots=True)

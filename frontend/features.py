@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from groundfuse.backend.measurement import Attitude
+from groundfuse.backend.option_checks import check_numbers
 from groundfuse.frontend.arrays import Floats, Image, Mask, Picture32, Points
 from groundfuse.frontend.camera import Camera
 from groundfuse.frontend.keypoints import Keypoints, blobs, corners
@@ -60,7 +61,8 @@ class FeatureOptions:
     cell_px: int = 48
 
     def __post_init__(self) -> None:
-        """Refuse a kind that there is not (ValueError)."""
+        """Refuse a kind that there is not, and numbers that make no sense (ValueError)."""
+        check_numbers(self, may_be_zero=("contrast_threshold", "sigma_image_px"))
         if self.kind not in {"sift", "orb"}:
             raise ValueError(f"kind must be sift or orb, got {self.kind!r}")
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groundfuse.backend.measurement import Attitude, Correspondences, Se2, wrap_rad
+from groundfuse.backend.option_checks import check_numbers
 from groundfuse.frontend.arrays import Floats, Mask
 from groundfuse.frontend.fit_compiled import Asked, Pairs, fit_rows
 
@@ -33,6 +34,10 @@ class FitOptions:
     cauchy_sigmas: float = 2.0
     gate_sigmas: float = 3.5
     min_noise: float = 0.28
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that make no sense (ValueError)."""
+        check_numbers(self, may_be_inf=("cauchy_sigmas", "gate_sigmas"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

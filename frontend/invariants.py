@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from groundfuse.backend.option_checks import check_numbers
 from groundfuse.frontend.arrays import Floats, Image, Mask, Picture32, Points
 from groundfuse.frontend.normalise import local_contrast
 
@@ -30,6 +31,10 @@ class InvariantOptions:
     """Normalise the contrast of each colour within this sigma first; 0 for none, as printed."""
     contrast_floor_grey: float = 1.5
     """Smallest standard deviation that the contrast is normalised by, grey values."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that make no sense (ValueError)."""
+        check_numbers(self, may_be_zero=("contrast_radius_cells",))
 
 
 def sigmoid(t: Floats, mu: Floats | float, t0: Floats | float) -> Floats:

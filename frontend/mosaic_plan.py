@@ -9,6 +9,7 @@ from statistics import median
 import numpy as np
 
 from groundfuse.backend.measurement import Attitude, FrameId, Se2
+from groundfuse.backend.option_checks import check_numbers
 from groundfuse.frontend.arrays import Image
 from groundfuse.frontend.camera import Camera
 from groundfuse.frontend.footprint import Footprint, footprint
@@ -66,6 +67,12 @@ class MosaicOptions:
     workers: int = 2
     """Threads; each holds one tile."""
 
+    def __post_init__(self) -> None:
+        """Refuse numbers that make no sense (ValueError)."""
+        if not 1 <= self.max_depth <= DEEPEST:
+            raise ValueError(f"max_depth must be 1 to {DEEPEST}, got {self.max_depth}")
+        check_numbers(self, may_be_inf=("num_sigmas",))
+
 
 @dataclass(frozen=True, slots=True)
 class Extent:
@@ -120,7 +127,7 @@ def plan_mosaic(views: Sequence[MosaicView], options: MosaicOptions) -> MosaicPl
             large; no floor that any view resolves.
     """
     ordered = tuple(sorted(views, key=lambda view: view.frame))
-    _check(ordered, options)
+    _check(ordered)
     prints = [footprint(v.camera, v.attitude, v.team_from_foot) for v in ordered]
     useful_m = _useful_m(ordered, prints)
     limit_m = tuple(options.far_footprint * useful_m[view.frame.robot] for view in ordered)
@@ -142,16 +149,12 @@ def plan_mosaic(views: Sequence[MosaicView], options: MosaicOptions) -> MosaicPl
     return MosaicPlan(ordered, grid, limit_m, finest_m, extents)
 
 
-def _check(views: Sequence[MosaicView], options: MosaicOptions) -> None:
+def _check(views: Sequence[MosaicView]) -> None:
     if not views:
         raise ValueError("a mosaic needs at least one view, got none")
     for a, b in pairwise(views):
         if a.frame == b.frame:
             raise ValueError(f"a mosaic takes every frame once, got {a.frame} twice")
-    if options.m_per_px is not None and not options.m_per_px > 0.0:
-        raise ValueError(f"m_per_px must be positive, got {options.m_per_px:g}")
-    if not 1 <= options.max_depth <= DEEPEST:
-        raise ValueError(f"max_depth must be 1 to {DEEPEST}, got {options.max_depth}")
 
 
 def _useful_m(views: Sequence[MosaicView], prints: Sequence[Footprint]) -> dict[str, float]:

@@ -12,6 +12,7 @@ from groundfuse.backend.measurement import (
     RelativePose,
     Se2,
 )
+from groundfuse.backend.option_checks import check_numbers
 from groundfuse.frontend.arrays import Floats, Mask
 from groundfuse.frontend.fit import FitOptions, PairFit, Prior, fit_pair
 from groundfuse.frontend.matches import Matches, Miss
@@ -43,6 +44,20 @@ class MotionOptions:
     max_noise: float = 4.0
     max_attitude_chi2: float = 33.0
     max_sigma_heights: float = 0.1
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that make no sense (ValueError)."""
+        check_numbers(
+            self,
+            may_be_zero=("max_ambiguity",),
+            may_be_inf=(
+                "max_photometric_chi2",
+                "max_ambiguity",
+                "max_noise",
+                "max_attitude_chi2",
+                "max_sigma_heights",
+            ),
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

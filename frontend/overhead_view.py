@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groundfuse.backend.measurement import Attitude
+from groundfuse.backend.option_checks import check_numbers
 from groundfuse.frontend.area_remap import AreaPlan, area_plan, area_read, singular_values
 from groundfuse.frontend.arrays import Floats, Image, Mask, Points
 from groundfuse.frontend.camera import Camera
@@ -39,6 +40,10 @@ class OverheadOptions:
     """The floor is used as far as a picture pixel covers at most this many cells in length."""
     max_cells: int = 200_000_000
     """Refuse larger rasters, cells."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that make no sense (ValueError)."""
+        check_numbers(self)
 
 
 @dataclass(frozen=True, slots=True)

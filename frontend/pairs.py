@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from groundfuse.backend.measurement import FrameId
+from groundfuse.backend.option_checks import check_numbers
 from groundfuse.frontend.features import Features
 from groundfuse.frontend.predicted import Pair, PredictedOptions
 from groundfuse.frontend.retrieval import RetrievalOptions, retrieved
@@ -28,6 +29,10 @@ class PairOptions:
     retrieval: RetrievalOptions = field(default_factory=RetrievalOptions)
     predicted: PredictedOptions = field(default_factory=PredictedOptions)
     max_skip: int = 3
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that make no sense (ValueError)."""
+        check_numbers(self, may_be_zero=("max_skip",))
 
 
 def neighbour_pairs(frames: Sequence[FrameId]) -> list[Pair]:

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from groundfuse.backend.measurement import Attitude, Correspondences, Reason
+from groundfuse.backend.option_checks import check_numbers
 from groundfuse.frontend.arrays import Floats, Image, Picture32, Points
 from groundfuse.frontend.camera import Camera
 from groundfuse.frontend.corners import CornerOptions, find_corners
@@ -63,6 +64,10 @@ class PaperOptions:
     """Fewest corners that agree on the homography."""
     min_inlier_ratio: float = 0.08
     """Fewest over the corners of the frame that has fewer: chance alone gives up to 0.06."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that make no sense (ValueError)."""
+        check_numbers(self, may_be_zero=("min_inlier_ratio",), shares=("min_inlier_ratio",))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

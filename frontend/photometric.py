@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from groundfuse.backend.measurement import Attitude, Se2
+from groundfuse.backend.option_checks import check_numbers
 from groundfuse.frontend.arrays import Floats, Image, Mask, Picture32, Points
 from groundfuse.frontend.camera import Camera, Intrinsics
 from groundfuse.frontend.fit import Prior
@@ -53,6 +54,10 @@ class PhotometricOptions:
     cauchy_sigmas: float = 2.0
     correlation: float = 2.0
     max_residual: float = 1.8
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that make no sense (ValueError)."""
+        check_numbers(self, may_be_inf=("max_stretch", "max_residual"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

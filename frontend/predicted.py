@@ -14,6 +14,7 @@ from scipy.sparse import coo_array, eye_array
 from scipy.spatial import KDTree
 
 from groundfuse.backend.measurement import Attitude, FrameId, Se2
+from groundfuse.backend.option_checks import check_numbers
 from groundfuse.frontend.arrays import Points
 from groundfuse.frontend.camera import Camera
 from groundfuse.frontend.footprint import footprint
@@ -48,6 +49,7 @@ class PredictedOptions:
             raise ValueError(f"least_overlap must lie within 0 to 1, got {self.least_overlap:g}")
         if self.near_edges < 0 or self.near_edges % 2:
             raise ValueError(f"near_edges must be even and not negative, got {self.near_edges}")
+        check_numbers(self, may_be_zero=("num_frames", "near_edges", "least_pairs"))
 
 
 def floor_outline(

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import KDTree
 
+from groundfuse.backend.option_checks import check_numbers
 from groundfuse.frontend.arrays import Floats, Matrix, Points
 
 NEIGHBOURHOOD = 0.08
@@ -34,6 +35,10 @@ class RefineOptions:
     """Corners in a window that are looked at, closest first."""
     min_matches: int = 12
     """Fewest matches that a homography is fitted to."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that make no sense (ValueError)."""
+        check_numbers(self, may_be_inf=("max_difference",))
 
 
 class Guided(NamedTuple):

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from groundfuse.backend.option_checks import check_numbers
 from groundfuse.frontend.features import Features
 
 Short = NDArray[np.float32]
@@ -52,6 +53,10 @@ class RetrievalOptions:
     num_frames: int = 8
     num_others: int = 3
     least_votes: float = 4.5
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that make no sense (ValueError)."""
+        check_numbers(self, may_be_zero=("num_frames", "num_others", "least_votes"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from groundfuse.backend.measurement import Se2
+from groundfuse.backend.option_checks import check_numbers
 from groundfuse.frontend.arrays import Floats, Picture32, Points
 
 RANK_TABLE = 256
@@ -52,6 +53,15 @@ class SegmentOptions:
     """Turns are compared as the way of a point at this distance."""
     num_modes: int = 4
     """Distinct isometries that are looked for."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that make no sense (ValueError)."""
+        check_numbers(
+            self,
+            may_be_zero=("length_tolerance_ratio",),
+            may_be_inf=("max_length",),
+            may_be_negative=("min_correlation",),
+        )
 
 
 class SegmentView(NamedTuple):

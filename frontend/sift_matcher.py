@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from groundfuse.backend.measurement import Correspondences, Reason
+from groundfuse.backend.option_checks import check_numbers
 from groundfuse.frontend.arrays import Picture32
 from groundfuse.frontend.consensus import (
     Candidates,
@@ -48,6 +49,14 @@ class MatchOptions:
     homography_tolerance_px: float = 2.0
     max_log_size: float = 0.5
     rigid_tolerance_heights: float = 0.06
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that make no sense (ValueError)."""
+        check_numbers(
+            self,
+            may_be_zero=("tolerance_sigmas", "scale_sigmas", "rigid_tolerance_heights"),
+            may_be_inf=("max_log_size", "rigid_tolerance_heights"),
+        )
 
 
 def match(

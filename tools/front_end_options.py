@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
+from groundfuse.backend.option_checks import check_numbers
 from groundfuse.frontend import paper_matcher, sift_matcher
 from groundfuse.frontend.features import FeatureOptions
 from groundfuse.frontend.motion import MotionOptions
@@ -43,6 +44,10 @@ class FrontEndOptions:
     pairs: PairOptions = field(default_factory=PairOptions)
     photometric: bool = False
     odometry_gate_sigmas: float = 4.0
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that make no sense (ValueError)."""
+        check_numbers(self, may_be_inf=("odometry_gate_sigmas",))
 
 
 def with_matcher(options: FrontEndOptions, matcher: Matcher) -> FrontEndOptions:

@@ -25,6 +25,7 @@ from groundfuse.backend.measurement import (
     Se2,
     TeamEstimate,
 )
+from groundfuse.backend.option_checks import check_numbers
 from groundfuse.backend.team import TeamOptions, fuse
 from groundfuse.frontend.predicted import Pair, floor_outline, predicted_pairs
 from groundfuse.frontend.repetition import REPEATS
@@ -57,6 +58,10 @@ class PipelineOptions:
     team: TeamOptions = field(default_factory=TeamOptions)
     bundle: BundleOptions = field(default_factory=BundleOptions)
     more_looks: int = 2
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that make no sense (ValueError)."""
+        check_numbers(self, may_be_zero=("more_looks",))
 
 
 @dataclass(slots=True)
