@@ -1,5 +1,6 @@
 """Keypoints of an overhead view: where blobs stand out, spread over the floor, and described."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import cv2
@@ -19,6 +20,9 @@ SECOND = 0.8
 """A direction counts from this share of the strongest on."""
 TURNING_LEVEL = 4
 """Directions are read from a level that is smoother than the blobs: they are steadier there."""
+SIZES = 2
+"""Sizes, each 1.2 times the next, at which corners are looked for: an overhead view has one scale,
+and what heights and wobble add to it is less than the second size."""
 MOST = 3.2
 """Brighter and darker than this many local standard deviations is cut: lamps, holes."""
 
@@ -108,17 +112,22 @@ def corners(flat: Image, inner: Mask, wanted: int, least_grey: float, cell_px: i
         least_grey: grey values by which a corner's arc differs at least.
         cell_px: side of the cells over which they are spread.
     """
-    orb = cv2.ORB.create(nfeatures=2 * wanted + 1, fastThreshold=round(least_grey), nlevels=4)
+    orb = cv2.ORB.create(nfeatures=2 * wanted + 1, fastThreshold=round(least_grey), nlevels=SIZES)
     many = orb.detect(flat, inner.astype(np.uint8))
-    points = np.array([k.pt for k in many], dtype=np.float64).reshape(-1, 2)
+    points = _points(many)
     strength = np.array([k.response for k in many], dtype=np.float64)
     kept, bits = orb.compute(flat, [many[i] for i in spread(points, strength, wanted, cell_px)])
     return Keypoints(
-        np.array([k.pt for k in kept], dtype=np.float64).reshape(-1, 2),
+        _points(kept),
         np.array([k.size for k in kept], dtype=np.float64),
         np.radians(np.array([k.angle for k in kept], dtype=np.float64)),
         np.zeros((0, 32), np.uint8) if bits is None else np.asarray(bits, dtype=np.uint8),
     )
+
+
+def _points(keypoints: Sequence[cv2.KeyPoint]) -> Points:
+    """Return u and v of OpenCV's keypoints (n, 2)."""
+    return np.asarray(cv2.KeyPoint.convert(keypoints), dtype=np.float64).reshape(-1, 2)
 
 
 def strongest(strength: Floats, wanted: int) -> NDArray[np.int64]:
