@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 from floor_pairs import error_of, geometric_pair, prior
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from groundfuse.backend.measurement import Attitude, Se2

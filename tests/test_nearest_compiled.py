@@ -1,7 +1,7 @@
 """The nearest columns are those of a stable sort."""
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from groundfuse.frontend.nearest_compiled import most_similar
