@@ -11,15 +11,18 @@ import numpy as np
 import pytest
 from painted_team import QUICK, painted_pair
 
+from groundfuse.tools import fuse_team
+
 ROOT = Path(__file__).parents[1]
 SETTINGS = [word for setting in QUICK for word in ("--set", setting)]
 TIMED = {"report.txt", "store.sqlite", "store.sqlite.lock"}
 
 
-def start(out, *more):
+def start(out, *more, preexec_fn=None):
     command = [sys.executable, str(ROOT / "tools" / "fuse_team.py"), "--team", str(painted_pair())]
     command += ["--out", str(out), "--quiet", "--no-mosaic", *SETTINGS, *more]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    both = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    return subprocess.Popen(command, **both, text=True, preexec_fn=preexec_fn)  # noqa: PLW1509
 
 
 def finish(process):
@@ -62,6 +65,47 @@ def test_killed_again_and_again_it_ends_the_same(undisturbed, tmp_path):
     assert "team in 1 component" in text
     assert "\nfrom the store: " in text
     assert content(out) == wanted
+
+
+def heeding_ctrl_c():
+    """A process started in the background may have been told to ignore it."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.mark.parametrize("share", [0.15, 0.6])
+def test_interrupted_it_says_so_in_one_line_and_goes_on(undisturbed, tmp_path, share):
+    """Ctrl-C while it looks at pictures, and while it compares pairs."""
+    wanted, full = undisturbed
+    out = tmp_path / "out"
+    process = start(out, preexec_fn=heeding_ctrl_c)
+    while process.poll() is None and stored_bytes(out) < share * full:
+        time.sleep(0.002)
+    process.send_signal(signal.SIGINT)
+    text, _ = process.communicate(timeout=60)
+    store = out / "store.sqlite"
+    assert text == (
+        f"fuse_team: interrupted; what was finished is in {store}, the same command goes on "
+        "from there\n"
+    )
+    assert process.returncode == 130
+    assert not (out / "store.sqlite-wal").exists()  # closed, not left
+    assert "\nfrom the store: " in finish(start(out))
+    assert content(out) == wanted
+
+
+def test_what_an_interrupted_run_leaves_is_told(tmp_path, capsys, monkeypatch):
+    def stopped(*_, **__):
+        raise KeyboardInterrupt
+
+    words = ["--team", str(painted_pair()), "--out", str(tmp_path), "--fresh", "--quiet"]
+    monkeypatch.setattr(fuse_team, "fuse_robots", stopped)
+    assert fuse_team.main(words) == 130
+    kept = f"what was finished is in {tmp_path / 'store.sqlite'}, "
+    again = "the same command without --fresh goes on from there"
+    assert capsys.readouterr().err == f"fuse_team: interrupted; {kept}{again}\n"
+    monkeypatch.setattr(fuse_team, "read_team", stopped)
+    assert fuse_team.main([*words, "--store", str(tmp_path / "none")]) == 130
+    assert capsys.readouterr().err == "fuse_team: interrupted\n"
 
 
 def test_a_second_run_at_the_same_time_is_told_so(undisturbed, tmp_path):  # noqa: ARG001

@@ -10,6 +10,7 @@ import pytest
 
 from groundfuse.backend.measurement import FrameId
 from groundfuse.frontend.camera import Distortion
+from groundfuse.tools import render_team
 from groundfuse.tools.lawn import plan_lawn
 from groundfuse.tools.overlap import View, true_overlap
 from groundfuse.tools.photometry import Photometry
@@ -137,6 +138,15 @@ def test_a_bad_command_line_is_one_line_and_exit_code_2(arguments, text, capsys)
         main(arguments)
     assert caught.value.code == 2
     assert capsys.readouterr().err == f"render_team.py: {text}\n"
+
+
+def test_stopping_it_is_one_line(tmp_path, capsys, monkeypatch):
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(render_team, "render", stopped)
+    assert main(["--out", str(tmp_path / "out")]) == 130
+    assert capsys.readouterr().err == "render_team.py: interrupted\n"
 
 
 def test_help_names_every_floor(capsys):

@@ -33,12 +33,11 @@ from groundfuse.tools.graph_outputs import (
     write_tables,
 )
 from groundfuse.tools.graph_report import GraphRun, report
-from groundfuse.tools.one_line_parser import OneLineParser
+from groundfuse.tools.one_line_parser import INTERRUPTED, OneLineParser
 from groundfuse.tools.outputs import files_before
 from groundfuse.tools.pipeline import Stopwatch
 
 log = logging.getLogger(__name__)
-INTERRUPTED = 130
 EPILOG = """\
 examples:
   fuse_graphs.py robot1.g2o robot2.g2o --overlaps overlaps.g2o

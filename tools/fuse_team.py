@@ -32,6 +32,7 @@ from groundfuse.tools.files import make_folder, write_atomic
 from groundfuse.tools.finished import unless_finished
 from groundfuse.tools.floor_check import check_floor
 from groundfuse.tools.front_end_options import Matcher, with_matcher
+from groundfuse.tools.one_line_parser import INTERRUPTED
 from groundfuse.tools.open3d_check import check_with_open3d
 from groundfuse.tools.outputs import (
     check_names,
@@ -78,7 +79,7 @@ class RunOptions(PipelineOptions):
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; 0 where a map was made, 2 where the input does not allow one."""
+    """Run the command; 0 where a map was made, 2 where the input allows none, 130 on Ctrl-C."""
     asked = parser().parse_args(arguments)
     logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.INFO)
     cv2.setNumThreads(1)
@@ -87,6 +88,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except TeamError as error:
         print(f"fuse_team: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print(f"fuse_team: {_interrupted(asked)}", file=sys.stderr)
+        return INTERRUPTED
     return 0
 
 
@@ -167,6 +171,15 @@ def _fused(desk: _Desk, robots: Sequence[Robot], workers: Workers) -> tuple[Fuse
         write_atomic(desk.out / "report.txt", table)
         print(table, end="")
     return fused, old
+
+
+def _interrupted(asked: argparse.Namespace) -> str:
+    """Return what a run that was stopped leaves behind."""
+    store = asked.store or asked.out / STORE
+    if not store.exists():
+        return "interrupted"
+    same = "the same command without --fresh" if asked.fresh else "the same command"
+    return f"interrupted; what was finished is in {store}, {same} goes on from there"
 
 
 def _write_numbers(out: Path, fused: Fused, drift: Mapping[str, Any], watch: Stopwatch) -> None:

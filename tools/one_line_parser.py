@@ -3,6 +3,9 @@
 import argparse
 from typing import NoReturn
 
+INTERRUPTED = 130
+"""Exit code of a command that Ctrl-C ended: what a shell makes of signal 2."""
+
 
 class OneLineParser(argparse.ArgumentParser):
     """The parser of one command.

@@ -23,7 +23,7 @@ from groundfuse.tools.errors import DataError, TeamError
 from groundfuse.tools.floors import FLOORS
 from groundfuse.tools.horizon import border_rays, check_horizon
 from groundfuse.tools.lawn import plan_lawn
-from groundfuse.tools.one_line_parser import OneLineParser
+from groundfuse.tools.one_line_parser import INTERRUPTED, OneLineParser
 from groundfuse.tools.overlap import View
 from groundfuse.tools.photometry import Photometry
 from groundfuse.tools.render_files import write_picture, write_truth
@@ -206,6 +206,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except TeamError as error:
         print(f"render_team.py: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("render_team.py: interrupted", file=sys.stderr)
+        return INTERRUPTED
     return 0
 
 

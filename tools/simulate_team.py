@@ -23,7 +23,7 @@ from groundfuse.backend.team_jrl import dataset_of_team, letters_of
 from groundfuse.tools.errors import TeamError
 from groundfuse.tools.files import make_folder, write_atomic
 from groundfuse.tools.graph_outputs import ENDING, Format
-from groundfuse.tools.one_line_parser import OneLineParser
+from groundfuse.tools.one_line_parser import INTERRUPTED, OneLineParser
 from groundfuse.tools.outputs import csv_text
 from groundfuse.tools.simulate_graphs import TeamGraphs, TeamShape, simulate
 
@@ -87,7 +87,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     except KeyboardInterrupt:
         print("simulate_team: interrupted", file=sys.stderr)
-        return 130
+        return INTERRUPTED
     return 0
 
 
