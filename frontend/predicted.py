@@ -7,10 +7,11 @@ any pair of its own needs another. Where the graph is dense already, one more pa
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
-from scipy.sparse import coo_array, eye_array
+from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
 from groundfuse.backend.measurement import Attitude, FrameId, Se2
@@ -142,9 +143,11 @@ def _apart(graph: Graph, pairs: list[Pair], options: PredictedOptions) -> list[P
     rows = [place[frame] for frame, others in graph.items() for _ in others]
     columns = [place[other] for others in graph.values() for other in others]
     size = len(graph)
-    step = coo_array((np.ones(len(rows), dtype=np.bool_), (rows, columns)), shape=(size, size))
-    one = step.tocsr() + eye_array(size, dtype=np.bool_, format="csr")
-    half = eye_array(size, dtype=np.bool_, format="csr")
+    here = np.arange(size)
+    ends = np.append(rows, here), np.append(columns, here)  # a frame is near itself too
+    ones = np.ones(len(ends[0]), dtype=np.bool_)
+    one = csr_array((ones, ends), shape=(size, size))
+    half: Any = csr_array((np.ones(size, dtype=np.bool_), (here, here)), shape=(size, size))
     for _ in range(options.near_edges // 2):
         half = half @ one
     i, j = (np.array([place[pair[end]] for pair in pairs], dtype=np.int64) for end in (0, 1))
@@ -152,7 +155,7 @@ def _apart(graph: Graph, pairs: list[Pair], options: PredictedOptions) -> list[P
     weak = few[i] | few[j]
     for start in range(0, len(pairs), CHUNK):
         part = slice(start, start + CHUNK)
-        meet = (half[i[part]] * half[j[part]]).sum(axis=1)
+        meet = half[i[part]].multiply(half[j[part]]).sum(axis=1)
         weak[part] |= np.asarray(meet).ravel() == 0
     return [pair for pair, is_weak in zip(pairs, weak.tolist(), strict=True) if is_weak]
 
