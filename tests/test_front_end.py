@@ -31,7 +31,7 @@ from groundfuse.tools.errors import DataError
 from groundfuse.tools.front_end import FrontEndResult, run_front_end
 from groundfuse.tools.front_end_options import FrontEndOptions, Matcher, with_matcher
 from groundfuse.tools.overlap import true_overlap
-from groundfuse.tools.pair_verdict import Seen, compare, look, odometry_gate, swayed
+from groundfuse.tools.pair_verdict import Spot, compare, look, odometry_gate, swayed
 from groundfuse.tools.robot import Frame, Odometry, Robot
 from groundfuse.tools.store import Store
 from groundfuse.tools.workers import AHEAD, Threads, in_threads
@@ -240,7 +240,7 @@ def test_matchers_bring_what_they_need():
     assert (fast.features.kind, fast.photometric, fast.matcher) == ("orb", True, Matcher.FAST)
     paper = with_matcher(plain, Matcher.PAPER)
     assert (paper.features.kind, paper.photometric, paper.matcher) == ("sift", False, Matcher.PAPER)
-    seen = look_at(FrameId("A", 0), options=fast)
+    _, seen = look_at(FrameId("A", 0), options=fast)
     assert (seen.features.descriptors.dtype, seen.paper) == (np.uint8, None)
     assert seen.grey is not None
 
@@ -330,7 +330,7 @@ def tile_results(seen):
 
 def test_no_edge_on_identical_tiles_without_a_prior():
     seen = tiled()
-    assert all(s.features.repetition > REPEATS for s in seen)
+    assert all(s.features.repetition > REPEATS for _, s in seen)
     for result in tile_results(seen):
         assert isinstance(result, Rejected)
         assert result.reason is Reason.AMBIGUOUS
@@ -391,7 +391,7 @@ def test_the_gate_grows_by_what_wobble_does_to_the_middle_of_the_views(tilt_deg,
     """Four root mean squares of both views' drawn shifts."""
     cam = camera(tilt_deg, sigma=Attitude(*sigma))
     frame = Frame(FrameId("A", 0), Path(), 0.0, cam.mount.attitude, cam.mount.sigma)
-    seen = Seen(frame, Robot("A", cam, (frame,)), None, None, None)
+    seen = Spot(frame, Robot("A", cam, (frame,)), b"")
     rng = np.random.default_rng(22)
     axis = np.zeros((1, 2))
     still = floor_from_rays(cam.mount.attitude, axis)
@@ -438,7 +438,7 @@ def test_the_odometry_gate_is_as_wide_as_odometry_is_wrong():
 def _seen(name, index, odometry):
     """A frame of which only the odometry matters."""
     member = robot(name, odometry=odometry)
-    return Seen(member.frames[index], member, None, None, None)
+    return Spot(member.frames[index], member, b"")
 
 
 def test_there_is_no_gate_without_odometry_all_the_way():

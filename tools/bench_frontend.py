@@ -28,8 +28,9 @@ from groundfuse.frontend.camera import Camera, Intrinsics, Mount
 from groundfuse.frontend.repetition import REPEATS
 from groundfuse.tools import render_team
 from groundfuse.tools.drift_table import drift_record
+from groundfuse.tools.frame_look import Looked
 from groundfuse.tools.front_end_options import FrontEndOptions, Matcher, with_matcher
-from groundfuse.tools.pair_verdict import Seen, compare, look
+from groundfuse.tools.pair_verdict import Spot, compare, look
 from groundfuse.tools.pipeline import PipelineOptions, Stopwatch, fuse_robots
 from groundfuse.tools.robot import Frame, Robot
 from groundfuse.tools.team_folder import read_team
@@ -86,7 +87,9 @@ def clustered_team(floor: str, seed: int) -> RenderedTeam:
     return make_team(floor, seed, robots, num_obstacles=3)
 
 
-def _seen(team: RenderedTeam, options: FrontEndOptions) -> Iterator[tuple[RenderedFrame, Seen]]:
+def _seen(
+    team: RenderedTeam, options: FrontEndOptions
+) -> Iterator[tuple[RenderedFrame, tuple[Spot, Looked]]]:
     for robot in team.robots:
         known = Robot(robot.name, robot.camera, ())
         mount = robot.camera.mount
@@ -114,7 +117,7 @@ def bench_pairs(floor: str, seeds: Sequence[int], options: FrontEndOptions) -> l
         begin = time.perf_counter()
         views = list(_seen(team, options))
         look_s.append((time.perf_counter() - begin) / len(views))
-        repeating += [seen.features.repetition > REPEATS for _, seen in views]
+        repeating += [seen.features.repetition > REPEATS for _, (_, seen) in views]
         for (frame_a, a), (frame_b, b) in itertools.combinations(views, 2):
             begin = time.perf_counter()
             found = compare(a, b, options)

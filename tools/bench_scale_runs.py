@@ -22,9 +22,10 @@ from groundfuse.frontend.retrieval import RetrievalOptions, described, learned, 
 from groundfuse.tools import bench_frontend, fuse_team
 from groundfuse.tools.bench_scale_fleets import NAMES, TwiceMown, fleet_path
 from groundfuse.tools.errors import DataError
+from groundfuse.tools.frame_look import Looked
 from groundfuse.tools.front_end import run_front_end
 from groundfuse.tools.front_end_options import FrontEndOptions, Matcher, with_matcher
-from groundfuse.tools.pair_verdict import Seen, compare, look
+from groundfuse.tools.pair_verdict import Spot, compare, look
 from groundfuse.tools.pictures import write_mosaics
 from groundfuse.tools.pipeline import PipelineOptions, Stopwatch, fuse_robots
 from groundfuse.tools.render_files import picture_name
@@ -139,14 +140,14 @@ def speeds(floor: str, seed: int, matcher: Matcher) -> tuple[list[float], list[f
     options = with_matcher(FrontEndOptions(), matcher)
     team = bench_frontend.clustered_team(floor, seed)
     frames: list[float] = []
-    seen: list[Seen] = []
+    seen: list[tuple[Spot, Looked]] = []
     for rendered in team.robots:
         robot, mount = Robot(rendered.name, rendered.camera, ()), rendered.camera.mount
         for frame in rendered.frames:
             known = Frame(frame.id, Path(), 0.0, mount.attitude, mount.sigma)
             with _timed(frames):
-                found = look(frame.image, robot, known, options)
-            seen.append(replace(found, grey=None))
+                spot, found = look(frame.image, robot, known, options)
+            seen.append((spot, replace(found, grey=None)))
     pairs: list[float] = []
     for k, a in enumerate(seen):
         for b in seen[k + 1 :]:

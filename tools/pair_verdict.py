@@ -8,7 +8,6 @@ import functools
 import hashlib
 import math
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
@@ -19,7 +18,6 @@ from groundfuse.frontend.consensus import Gate
 from groundfuse.frontend.features import Features
 from groundfuse.frontend.fit import Prior
 from groundfuse.frontend.motion import MotionOptions, View, relative_pose
-from groundfuse.frontend.photometric import GreyView
 from groundfuse.tools.code_version import code_of
 from groundfuse.tools.frame_look import Looked, looked
 from groundfuse.tools.front_end_options import FrontEndOptions, Matcher
@@ -29,20 +27,6 @@ from groundfuse.tools.robot import Frame, Robot
 Verdict = RelativePose | Rejected
 
 
-class Placed(Protocol):
-    """A frame and whose it is."""
-
-    @property
-    def frame(self) -> Frame:
-        """The frame."""
-        ...
-
-    @property
-    def robot(self) -> Robot:
-        """Its robot."""
-        ...
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Spot:
     """A frame, its robot, and the key of what was seen there."""
@@ -50,17 +34,6 @@ class Spot:
     frame: Frame
     robot: Robot
     key: bytes
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Seen:
-    """A frame as matching sees it; see `Looked`."""
-
-    frame: Frame
-    robot: Robot
-    features: Features
-    paper: paper_matcher.PaperFeatures | None
-    grey: GreyView | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,16 +57,14 @@ class PairJob:
     key: bytes
 
 
-def look(image: Image, robot: Robot, frame: Frame, options: FrontEndOptions) -> Seen:
-    """Return everything that matching needs to know of one picture."""
-    found = looked(image, robot.camera, frame, options)
-    return Seen(frame, robot, found.features, found.paper, found.grey)
+def look(image: Image, robot: Robot, frame: Frame, options: FrontEndOptions) -> tuple[Spot, Looked]:
+    """Return everything that matching needs to know of one picture, without a key."""
+    return Spot(frame, robot, b""), looked(image, robot.camera, frame, options)
 
 
-def compare(a: Seen, b: Seen, options: FrontEndOptions) -> Verdict:
+def compare(a: tuple[Spot, Looked], b: tuple[Spot, Looked], options: FrontEndOptions) -> Verdict:
     """Match two frames and fit the motion between them."""
-    spot_a, spot_b = Spot(a.frame, a.robot, b""), Spot(b.frame, b.robot, b"")
-    seen_a, seen_b = (Looked(s.features, s.paper, s.grey) for s in (a, b))
+    (spot_a, seen_a), (spot_b, seen_b) = a, b
     return verdict(pair_job(spot_a, spot_b, options), seen_a, seen_b, options)
 
 
@@ -154,7 +125,7 @@ def _seed(a: Features, b: Features) -> list[int]:
     return [int.from_bytes(digest, "little") for digest in both]
 
 
-def odometry_gate(a: Placed, b: Placed, options: FrontEndOptions) -> Gate | None:
+def odometry_gate(a: Spot, b: Spot, options: FrontEndOptions) -> Gate | None:
     """Return where odometry allows frame b to be, seen from frame a of the same robot."""
     first, last = a.frame.odometry, b.frame.odometry
     if a.robot.name != b.robot.name or first is None or last is None:
@@ -177,7 +148,7 @@ def odometry_gate(a: Placed, b: Placed, options: FrontEndOptions) -> Gate | None
     return Gate(_foot_motion(mount_a, mount_b, motion), gate * radius_m, gate * turn_rad)
 
 
-def swayed(gate: Gate, a: Placed, b: Placed, options: FrontEndOptions) -> Gate:
+def swayed(gate: Gate, a: Spot, b: Spot, options: FrontEndOptions) -> Gate:
     """Widen a gate by how far the wobble moves the floor in the middle of the views.
 
     Matching takes the cameras at their expected attitudes; only the fit knows better.
