@@ -22,6 +22,7 @@ case "$1 $2" in
   "- ") exit 0 ;;
   "-m venv") mkdir -p .venv/bin && cp "$0" .venv/bin/python ;;
   "-m pip") [ "$3" = "$FAIL" ] && exit 1 ;;
+  "tools/fuse_team.py "*) [ "$FAIL" = fuse ] && echo "no floor" && exit 2 ;;
 esac
 exit 0
 """
@@ -72,13 +73,14 @@ def test_it_installs_once_and_again_only_after_a_change(machine):
     code, _, calls = set_up(machine)
     assert code == 0
     assert f"{PIP}--require-hashes -r requirements.lock" in calls
-    assert calls[-1] == f"{PIP}--no-deps --no-build-isolation -e ."
+    assert calls[-2] == f"{PIP}--no-deps --no-build-isolation -e ."
+    assert calls[-1].startswith("python tools/fuse_team.py --robots A B --out /")
     assert set_up(machine) == (0, "", [])
     (machine[0] / "requirements.lock").write_text("numpy==3\n")
     code, _, calls = set_up(machine)
     assert code == 0
     assert "python -m venv --clear .venv" not in calls
-    assert calls[-1] == f"{PIP}--no-deps --no-build-isolation -e ."
+    assert calls[-2] == f"{PIP}--no-deps --no-build-isolation -e ."
 
 
 def test_a_moved_checkout_is_set_up_anew(machine):
@@ -94,6 +96,15 @@ def test_a_failed_installation_is_tried_again(machine):
     code, said, calls = set_up(machine)
     assert code == 0
     assert calls
+
+
+def test_a_sample_that_cannot_be_fused_is_told_and_no_obstacle(machine):
+    """It only compiles the inner loops beforehand; the folder it wrote to is gone."""
+    code, said, calls = set_up(machine, FAIL="fuse")
+    assert code == 0
+    assert "setup: the sample could not be fused: no floor\n" in said
+    assert said.endswith("setup: done\n")
+    assert not Path(calls[-1].split()[-2]).exists()
 
 
 def test_a_machine_without_a_fitting_python_is_told_so(machine):

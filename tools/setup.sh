@@ -57,9 +57,20 @@ install_libraries
 if ! .venv/bin/python -m pip --version >/dev/null 2>&1; then
   "$python" -m venv --clear .venv
 fi
+# The inner loops become machine code at their first call, which would make the first map wait for
+# a minute. It is kept beside the sources.
+compile_loops() {
+  say "compiling the inner loops, once; a minute"
+  scratch=$(mktemp -d)
+  .venv/bin/python tools/fuse_team.py --robots A B --out "$scratch" --quiet >"$scratch/said" 2>&1 ||
+    say "the sample could not be fused: $(tail -1 "$scratch/said")"
+  rm -rf "$scratch"
+}
+
 rm -f "$stamp"
 say "installing into .venv, once; the 3D view makes it large, this takes some minutes"
 .venv/bin/python -m pip install -q --disable-pip-version-check --require-hashes -r requirements.lock
 .venv/bin/python -m pip install -q --disable-pip-version-check --no-deps --no-build-isolation -e .
+compile_loops
 printf '%s\n' "$wanted" >"$stamp"
 say "done"
