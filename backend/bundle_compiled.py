@@ -40,21 +40,23 @@ def _pair_blocks(out: Any, pairs: tuple[Any, Any], start: Any, place: Any, block
     """Write what frames have in common through the floor points they share.
 
     Args:
-        out: (n, 6, d) Q'J of every sighting.
+        out: (n, d, 6) Q'J of every sighting.
         pairs: sightings (k,) of the one and of the other frame.
         start: (pairs of frames + 1,) first of each pair of frames.
         place: (pairs of frames,) their blocks.
         blocks: (m, 6, 6).
     """
     one, other = pairs
+    total = np.zeros((BLOCK, BLOCK))
     for index in range(len(place)):
-        total = np.zeros((BLOCK, BLOCK))
+        total[:] = 0.0
         for s in range(start[index], start[index + 1]):
-            a, b = out[one[s]], out[other[s]]
-            for i in range(BLOCK):
-                for k in range(out.shape[2]):
+            a, b = one[s], other[s]
+            for k in range(out.shape[1]):
+                for i in range(BLOCK):
+                    factor = out[a, k, i]
                     for j in range(BLOCK):
-                        total[i, j] -= a[i, k] * b[j, k]
+                        total[i, j] -= factor * out[b, k, j]
         blocks[place[index]] = total
 
 

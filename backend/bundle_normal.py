@@ -16,6 +16,7 @@ from groundfuse.backend.bundle_plan import BLOCK
 from groundfuse.backend.bundle_priors import Pattern, Priors
 from groundfuse.backend.bundle_rows import Rows
 from groundfuse.backend.bundle_tracks import Integers, Observations
+from groundfuse.backend.side_by_side import side_by_side
 
 Array = NDArray[np.float64]
 
@@ -103,9 +104,14 @@ def reduce_rows(seen: Observations, rows: Rows, pattern: Pattern, priors: Priors
         by_frame[5, seen.first, 2] += rows.relief[1] * rows.relief[2] / root[2, 2]
         np.add.at(blocks[:, 5, 5], seen.frame[seen.first], rows.relief[2] ** 2)
     frame_blocks(rows.by_frame, by_frame, seen.frame_start, blocks)
-    beside = np.ascontiguousarray(by_frame.transpose(1, 0, 2))
+    beside = np.ascontiguousarray(by_frame.transpose(1, 2, 0))
     pairs = seen.pair_i, seen.pair_j
-    pair_blocks(beside, pairs, seen.pair_start, pattern.pair_at, blocks)
+
+    def between(part: slice) -> None:
+        start = seen.pair_start[part.start : part.stop + 1]
+        pair_blocks(beside, pairs, start, pattern.pair_at[part], blocks)
+
+    side_by_side(between, len(pattern.pair_at))
     by_lens = _lens_by_points(seen, lens_rows, priors) if lens_rows.size else None
     reduced = Reduced(rows, basis, by_frame, by_lens, root, blocks)
     if by_lens is not None:
