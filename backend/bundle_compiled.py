@@ -101,7 +101,7 @@ def _taken_steps(out: Any, step: Any, frame_start: Any, point: Any, rest: Any) -
 
 def _residuals(
     sightings: tuple[Any, Any, Any, Any],
-    frames: tuple[Any, Any, Any],
+    frames: tuple[Any, Any, Any, Any],
     points: Any,  # noqa: ANN401
     near: float,
     residual: Any,  # noqa: ANN401
@@ -111,25 +111,21 @@ def _residuals(
 
     Args:
         sightings: frame and point (n,), ray (n, 2) and the focal length's gain (n,).
-        frames: poses (frames, 3), attitudes (frames, 3), lens corrections (frames, 2).
+        frames: poses (frames, 3), cosines and sines (frames, 6) of heading, tilt and roll, heights
+            (frames,), lens corrections (frames, 2).
         points: (points, 3).
         near: least depth in heights.
         residual: (n, 2) measured minus predicted, written.
         unseen: (n,) whether a point is behind its camera, written.
     """
     frame_of, point_of, ray, gain = sightings
-    poses, attitudes, lenses = frames
-    known = -1
+    poses, turns, heights, lenses = frames
     for s in range(len(frame_of)):
         f = frame_of[s]
-        if f != known:  # sightings come frame by frame
-            known = f
-            turn_c, turn_s = np.cos(poses[f, 2]), np.sin(poses[f, 2])
-            tilt_c, tilt_s = np.cos(attitudes[f, 0]), np.sin(attitudes[f, 0])
-            roll_c, roll_s = np.cos(attitudes[f, 1]), np.sin(attitudes[f, 1])
+        turn_c, turn_s, tilt_c, tilt_s, roll_c, roll_s = turns[f]
         p = point_of[s]
         dx, dy = points[p, 0] - poses[f, 0], points[p, 1] - poses[f, 1]
-        height = attitudes[f, 2] - points[p, 2]
+        height = heights[f] - points[p, 2]
         qx, qy = turn_c * dx + turn_s * dy, turn_c * dy - turn_s * dx
         leaning = roll_s * qy + roll_c * height
         depth = tilt_s * qx + tilt_c * leaning

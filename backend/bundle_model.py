@@ -110,7 +110,10 @@ def residuals(seen: Observations, state: State, robot_of: Integers) -> tuple[Arr
     """
     result, unseen = np.empty((len(seen.frame), 2)), np.empty(len(seen.frame), dtype=np.bool_)
     sightings = seen.frame, seen.point, seen.ray, seen.gain
-    frames = state.pose, state.attitude, np.ascontiguousarray(state.shared[robot_of, 3:5])
+    angles = np.column_stack([state.pose[:, 2], state.attitude[:, :2]])
+    turns = np.stack([np.cos(angles), np.sin(angles)], axis=2).reshape(-1, 6)
+    lenses = np.ascontiguousarray(state.shared[robot_of, 3:5])
+    frames = state.pose, turns, np.ascontiguousarray(state.attitude[:, 2]), lenses
     residuals_of(sightings, frames, state.point, NEAR, result, unseen)
     return result, unseen
 

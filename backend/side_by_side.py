@@ -1,4 +1,4 @@
-"""Independent parts of a loop on all cores, where compiled code lets go of the interpreter's lock."""
+"""Independent parts of a loop on all cores: compiled code leaves the interpreter's lock alone."""
 
 import os
 from collections.abc import Callable

@@ -29,5 +29,5 @@ def test_an_error_of_a_slice_is_the_callers():
         if part.stop == 2 * LEAST_ITEMS:
             raise ValueError("the last slice")
 
-    with pytest.raises(ValueError, match="^the last slice$"):
+    with pytest.raises(ValueError, match=r"^the last slice$"):
         side_by_side(work, 2 * LEAST_ITEMS)
