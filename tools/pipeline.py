@@ -195,11 +195,13 @@ def _looked(
     """Match with these cameras, which are `mounts` off the files, and fuse."""
     store, watch = means.store, means.watch
     front = FrontEnd(cameras, options.front_end, means.workers, store, means.progress, watch.stage)
-    graphs = _graphs(robots, front.result(), options, means)
+    found = front.result()
+    graphs = _graphs(robots, found, options, means)
     further = _further_pairs(cameras, front.tried, graphs, options.front_end, means)
     if further:
         front.try_further(further)
-        graphs = _graphs(robots, front.result(), options, means)
+        found = front.result()
+        graphs = _graphs(robots, found, options, means)
     team, edges, rests_on = graphs.team, graphs.edges, graphs.rests_on
     known = [(r.camera, [(f.attitude, f.sigma) for f in r.frames]) for r in robots]
 
@@ -213,7 +215,7 @@ def _looked(
         with watch.stage("bundle"):
             refined = store.kept("bundle", "team", rests_on, refine)
     key = key_of("fused", rests_on, known)
-    return Fused(robots, cameras, front.result(), edges, graphs.alone, team, refined, key)
+    return Fused(robots, cameras, found, edges, graphs.alone, team, refined, key)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
