@@ -1,13 +1,14 @@
 """Resample a picture so that each output cell is the mean of the picture over that cell."""
 
 import math
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from groundfuse.frontend.area_compiled import PART_BITS, fill_means
+from groundfuse.frontend.area_compiled import PART_BITS, fill_means, quads_of
 from groundfuse.frontend.arrays import Floats, Image, Mask, Picture32
 
 MAX_SUPERSAMPLING = 8
@@ -40,7 +41,7 @@ class AreaPlan(NamedTuple):
         cells: (n, 2) uint32 rows and columns of the wanted cells.
         places: (n, samples ** 2, 2) float32 picture columns and rows at that level.
         starts: (n, samples ** 2) uint32 first of the four pixels around a place; see `fill_means`.
-        parts: (n, samples ** 2, 2) uint16 place behind it, 1 / 2 ** PART_BITS px.
+        parts: (n, samples ** 2) uint16 place behind it; see `fill_means`.
     """
 
     level: int
@@ -70,14 +71,15 @@ def area_plan(source_px: Floats, wanted: Mask, size_px: tuple[int, int]) -> Area
     places = blocks[wanted].reshape(-1, samples**2, 2)
     cells = np.argwhere(wanted).astype(np.uint32)
     if samples == 1:
-        nothing = np.zeros((0, 1), np.uint32), np.zeros((0, 1, 2), np.uint16)
+        nothing = np.zeros((0, 1), np.uint32), np.zeros((0, 1), np.uint16)
         return AreaPlan(level, samples, cells, places, *nothing)
     last = np.array([-(-side // 2**level) - 1 for side in size_px])
     whole = np.rint(places * np.float32(2**PART_BITS)).astype(np.int64)
     whole = np.clip(whole, 0, last << PART_BITS)  # beyond its border the picture goes on
-    first = np.minimum(whole >> PART_BITS, last - 1)
+    first = whole >> PART_BITS
     starts = (first[..., 1] * (last[0] + 1) + first[..., 0]).astype(np.uint32)
-    parts = (whole - (first << PART_BITS)).astype(np.uint16)
+    behind = whole - (first << PART_BITS)
+    parts = (behind[..., 1] << PART_BITS | behind[..., 0]).astype(np.uint16)
     return AreaPlan(level, samples, cells, places[:0], starts, parts)
 
 
@@ -94,33 +96,55 @@ def point_values(image: Image) -> Image:
     return np.asarray(points, dtype=image.dtype)
 
 
-def area_read(pyramid: list[Image], plan: AreaPlan, view: Image) -> None:
+@dataclass(slots=True, eq=False)
+class Halvings:
+    """A picture to read from, and what reading has made of it so far.
+
+    Attributes:
+        pictures: the picture, then halvings of it; grows where more are needed.
+        quads: those of each channel, by level; see `quads_of`.
+    """
+
+    pictures: list[Image]
+    quads: dict[int, list[NDArray[np.uint32]]] = field(default_factory=dict)
+
+    def picture(self, level: int) -> Image:
+        """Return the picture after so many halvings."""
+        while len(self.pictures) <= level:
+            halved = cv2.pyrDown(self.pictures[-1])
+            self.pictures.append(np.asarray(halved, dtype=self.pictures[0].dtype))
+        return self.pictures[level]
+
+    def quads_at(self, level: int) -> list[NDArray[np.uint32]]:
+        """Return the quads of each channel after so many halvings."""
+        if level not in self.quads:
+            planes = cv2.split(self.picture(level))
+            self.quads[level] = [quads_of(np.ascontiguousarray(plane)) for plane in planes]
+        return self.quads[level]
+
+
+def area_read(halvings: Halvings, plan: AreaPlan, view: Image) -> None:
     """Average the picture over each cell: the pyramid level that loses nothing, supersampled.
 
     Where the picture is coarser than the cells it is interpolated (bicubic).
 
     Args:
-        pyramid: the picture, then halvings of it; grows where more are needed.
+        halvings: of the picture.
         plan: where each cell reads.
         view: (rows, columns, ...) output picture; only the planned cells are written.
     """
-    picture = _level(pyramid, plan)
     if plan.samples > 1:
-        shape = picture.shape[1], math.prod(picture.shape[2:])
-        deep = view.reshape(*view.shape[:2], shape[1])
-        fill_means(picture.reshape(-1), shape, plan.starts, plan.parts, plan.cells, deep)
+        quads = halvings.quads_at(plan.level)
+        deep = view.reshape(*view.shape[:2], len(quads))
+        for channel, of_channel in enumerate(quads):
+            fill_means(of_channel, plan.starts, plan.parts, plan.cells, deep, channel)
         return
+    picture = halvings.picture(plan.level)
     for first in range(0, len(plan.cells), REMAPPED):
         some = slice(first, first + REMAPPED)
         u, v = (np.ascontiguousarray(plan.places[some, :, axis]) for axis in (0, 1))
         read = cv2.remap(picture, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         view[plan.cells[some, 0], plan.cells[some, 1]] = np.asarray(read)[:, 0]
-
-
-def _level(pyramid: list[Image], plan: AreaPlan) -> Image:
-    while len(pyramid) <= plan.level:
-        pyramid.append(np.asarray(cv2.pyrDown(pyramid[-1]), dtype=pyramid[0].dtype))
-    return pyramid[plan.level]
 
 
 def _level_and_factor(source_px: Floats, wanted: Mask) -> tuple[int, int]:

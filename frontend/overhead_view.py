@@ -13,7 +13,13 @@ import numpy as np
 
 from groundfuse.backend.measurement import Attitude
 from groundfuse.backend.option_checks import check_numbers
-from groundfuse.frontend.area_remap import AreaPlan, area_plan, area_read, singular_values
+from groundfuse.frontend.area_remap import (
+    AreaPlan,
+    Halvings,
+    area_plan,
+    area_read,
+    singular_values,
+)
 from groundfuse.frontend.arrays import Floats, Image, Mask, Points
 from groundfuse.frontend.camera import Camera
 from groundfuse.frontend.overhead import floor_from_rays, rays_from_floor
@@ -150,9 +156,9 @@ def overhead_view(
         )
     view = np.zeros((grid.height_px, grid.width_px, *image.shape[2:]), dtype=image.dtype)
     mask = np.zeros((grid.height_px, grid.width_px), dtype=np.bool_)
-    pyramid = [image]
+    halvings = Halvings([image])
     for rows, columns, seen, plan in _planned_tiles(camera, attitude, grid):
-        area_read(pyramid, plan, view[rows, columns])
+        area_read(halvings, plan, view[rows, columns])
         mask[rows, columns] = seen
     return view, mask
 

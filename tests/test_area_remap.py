@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from groundfuse.frontend.area_remap import area_plan, area_read, singular_values
+from groundfuse.frontend.area_remap import Halvings, area_plan, area_read, singular_values
 
 
 def test_jacobians_have_the_singular_values_of_numpy():
@@ -21,7 +21,7 @@ def test_a_tile_without_wanted_cells_is_no_error():
     source = np.full((6, 6, 2), np.nan)
     plan = area_plan(source, np.zeros((4, 4), bool), (9, 9))
     view = np.full((4, 4), 7, np.uint8)
-    area_read([np.zeros((9, 9), np.uint8)], plan, view)
+    area_read(Halvings([np.zeros((9, 9), np.uint8)]), plan, view)
     assert (view == 7).all()
 
 
@@ -35,7 +35,7 @@ def test_cells_are_means_of_bilinear_samples(side_px, channels):
     wanted = rng.random((20, 24)) < 0.7
     plan = area_plan(at, wanted, (31, 23))
     view = np.full((20, 24, *channels), 7, np.uint8)
-    area_read([picture], plan, view)
+    area_read(Halvings([picture]), plan, view)
     assert plan.samples == (1 if side_px == 1.0 else max(2, math.ceil(side_px / 1.25)))
     assert (view[~wanted] == 7).all()
     offsets = (np.arange(plan.samples) - (plan.samples - 1) / 2) / plan.samples * side_px
