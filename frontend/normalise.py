@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 
 from groundfuse.frontend.arrays import Image, Mask, Picture32
+from groundfuse.frontend.normalise_compiled import against_means, block_sums, centred_means
 
 PIXELS_PER_RADIUS = 3.0
 COARSEST_PX = 4
@@ -19,30 +20,32 @@ def local_contrast(grey: Image, mask: Mask, radius_px: float, floor_grey: float)
         floor_grey: smallest standard deviation, so that noise is not blown up.
     """
     step = min(COARSEST_PX, max(1, int(radius_px / PIXELS_PER_RADIUS)))
-    rows, columns = grey.shape
-    # Whole blocks: what is added has no weight.
-    shape = [-(-side // step) * step for side in grey.shape]
-    weight, value = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
-    weight[:rows, :columns] = mask
+    counted = np.ascontiguousarray(mask).view(np.uint8)
+    grey = np.ascontiguousarray(grey)
+    sums = block_sums(grey, counted, step)
+    count, total = (int(sums[kind].sum(dtype=np.int64)) for kind in (0, 1))
     # Squares of differences from a middle grey are small enough for single precision.
-    middle = np.float32(round(cv2.mean(grey, mask.astype(np.uint8))[0]))
-    np.subtract(grey, middle, out=value[:rows, :columns])
-    value *= weight
-    scale = np.maximum(_around(weight, radius_px, step), 1e-3)
-    mean = _around(value, radius_px, step) / scale
-    square = _around(value * value, radius_px, step) / scale
-    deviation = np.sqrt(np.maximum(square - mean * mean, floor_grey**2))
-    size = (shape[1], shape[0])
-    value -= cv2.resize(mean, size, interpolation=cv2.INTER_LINEAR)
-    value *= cv2.resize(1.0 / deviation, size, interpolation=cv2.INTER_LINEAR)
-    value *= weight
-    return value[:rows, :columns]
+    middle = round(total / max(1, count))
+    means = centred_means(sums, middle, step)
+    weight, value, square = (_blurred(blocks, radius_px / step) for blocks in means)
+    scale = np.maximum(weight, 1e-3)
+    mean = np.asarray(value / scale, dtype=np.float32)
+    deviation = np.sqrt(np.maximum(square / scale - mean * mean, floor_grey**2))
+    inverse = np.asarray(1.0 / deviation, dtype=np.float32)
+    found: Picture32 = against_means(
+        grey, counted, _across(mean, step), _across(inverse, step), step, middle
+    )
+    return found
 
 
-def _around(picture: Picture32, radius_px: float, step: int) -> Picture32:
-    """Gaussian means of blocks of `step` x `step` pixels: so smooth a picture needs no more."""
-    rows, columns = picture.shape
-    size = (columns // step, rows // step)
-    coarse = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-    blurred = cv2.GaussianBlur(coarse, (0, 0), radius_px / step, borderType=cv2.BORDER_REFLECT)
+def _blurred(blocks: Picture32, sigma: float) -> Picture32:
+    """Gaussian means of blocks: so smooth a picture needs no more."""
+    blurred = cv2.GaussianBlur(blocks, (0, 0), sigma, borderType=cv2.BORDER_REFLECT)
     return np.asarray(blurred, dtype=np.float32)
+
+
+def _across(blocks: Picture32, step: int) -> Picture32:
+    """Blocks as wide as pixels, linear in between; they stay as high as they are."""
+    size = (blocks.shape[1] * step, blocks.shape[0])
+    wide = cv2.resize(blocks, size, interpolation=cv2.INTER_LINEAR)
+    return np.asarray(wide, dtype=np.float32)

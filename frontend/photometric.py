@@ -19,6 +19,7 @@ from groundfuse.frontend.camera import Camera, Intrinsics
 from groundfuse.frontend.fit import Prior
 from groundfuse.frontend.fit_compiled import transfer_rows
 from groundfuse.frontend.normalise import local_contrast
+from groundfuse.frontend.normalise_compiled import halves
 
 RAY_STEP = 1e-6
 MAD_TO_SIGMA = 1.4826
@@ -103,7 +104,7 @@ def grey_view(image: Image, camera: Camera, options: PhotometricOptions) -> Grey
     first, last = camera.used_rows
     mask[first : last + 1] = True
     normalised = local_contrast(grey, mask, options.contrast_radius_px, options.contrast_floor_grey)
-    return GreyView(normalised.astype(np.float16), camera)
+    return GreyView(halves(normalised).view(np.float16), camera)
 
 
 def align(
