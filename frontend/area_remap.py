@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from groundfuse.frontend.area_compiled import PART_BITS, fill_means, quads_of
+from groundfuse.frontend.area_compiled import fill_means, quads_of
 from groundfuse.frontend.arrays import Floats, Image, Mask, Picture32
+from groundfuse.frontend.plan_compiled import samples_of_cells
 
 MAX_SUPERSAMPLING = 8
 PX_PER_SAMPLE = 1.25
@@ -63,24 +64,15 @@ def area_plan(source_px: Floats, wanted: Mask, size_px: tuple[int, int]) -> Area
     """
     level, samples = _level_and_factor(source_px, wanted)
     level = min(level, int(math.log2(min(size_px) - 1)))
-    maps = np.nan_to_num(source_px / 2.0**level, nan=OUTSIDE_PX).astype(np.float32)
-    fine = cv2.resize(maps, None, fx=samples, fy=samples, interpolation=cv2.INTER_LINEAR)
-    inner = np.asarray(fine, dtype=np.float32)[samples:-samples, samples:-samples]
-    rows, columns = wanted.shape
-    blocks = inner.reshape(rows, samples, columns, samples, 2).swapaxes(1, 2)
-    places = blocks[wanted].reshape(-1, samples**2, 2)
+    maps = np.nan_to_num(source_px / 2.0**level, nan=OUTSIDE_PX)
     cells = np.argwhere(wanted).astype(np.uint32)
     if samples == 1:
+        places = maps[1:-1, 1:-1][wanted].astype(np.float32)[:, None]
         nothing = np.zeros((0, 1), np.uint32), np.zeros((0, 1), np.uint16)
         return AreaPlan(level, samples, cells, places, *nothing)
-    last = np.array([-(-side // 2**level) - 1 for side in size_px])
-    whole = np.rint(places * np.float32(2**PART_BITS)).astype(np.int64)
-    whole = np.clip(whole, 0, last << PART_BITS)  # beyond its border the picture goes on
-    first = whole >> PART_BITS
-    starts = (first[..., 1] * (last[0] + 1) + first[..., 0]).astype(np.uint32)
-    behind = whole - (first << PART_BITS)
-    parts = (behind[..., 1] << PART_BITS | behind[..., 0]).astype(np.uint16)
-    return AreaPlan(level, samples, cells, places[:0], starts, parts)
+    last = tuple(-(-side // 2**level) - 1 for side in size_px)
+    found = samples_of_cells(maps, cells, samples, last)
+    return AreaPlan(level, samples, cells, np.zeros((0, 1, 2), np.float32), *found)
 
 
 def point_values(image: Image) -> Image:

@@ -118,8 +118,9 @@ class Intrinsics:
     def px_from_rays(self, rays: Points) -> Points:
         """Project rays (n, 2) to distorted pixels (n, 2); nan stays nan."""
         if self.is_pinhole:
-            focal, centre = np.array([self.fx_px, self.fy_px]), np.array([self.cx_px, self.cy_px])
-            pinhole: Points = rays * focal + centre
+            pinhole = np.empty(rays.shape)  # column by column: rows of two are slow to walk
+            pinhole[:, 0] = rays[:, 0] * self.fx_px + self.cx_px
+            pinhole[:, 1] = rays[:, 1] * self.fy_px + self.cy_px
             return pinhole
         if self.model is Distortion.EQUIDISTANT:
             return self._fisheye_px(rays)

@@ -22,7 +22,8 @@ from groundfuse.frontend.area_remap import (
 )
 from groundfuse.frontend.arrays import Floats, Image, Mask, Points
 from groundfuse.frontend.camera import Camera
-from groundfuse.frontend.overhead import floor_from_rays, rays_from_floor
+from groundfuse.frontend.overhead import floor_from_rays, foot_from_cam
+from groundfuse.frontend.plan_compiled import rays_of_cells
 
 TILE_PX = 256
 """Raster pixels per tile: remap takes no picture of 32767 px or more, and no tile needs many."""
@@ -89,15 +90,10 @@ def raster_cell_m(camera: Camera, options: OverheadOptions) -> float:
     """Return the side of a raster cell: as given, or from the mount's height, m.
 
     Frames of one camera share it whatever their own heights, so that descriptors compare.
-
-    Raises:
-        ValueError: the given cell is not positive.
     """
     if options.m_per_px is None:
         height_m = camera.mount.attitude.height_m
         return height_m * max(options.cell_per_height, 1.0 / camera.intrinsics.focal_px)
-    if not options.m_per_px > 0.0:
-        raise ValueError(f"m_per_px must be positive, got {options.m_per_px:g}")
     return options.m_per_px
 
 
@@ -228,12 +224,14 @@ def _source_px(
     widest: float,
 ) -> Floats:
     """Picture coordinates (rows + 2, columns + 2, 2) of a tile with a margin of one cell."""
-    rows, columns = tile
-    u, v = np.arange(columns.start - 1, columns.stop + 1), np.arange(rows.start - 1, rows.stop + 1)
-    cells = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2).astype(np.float64)
-    rays = rays_from_floor(attitude, grid.floor_from_overhead(cells))
-    rays[~(np.hypot(rays[:, 0], rays[:, 1]) <= widest)] = np.nan
-    return camera.intrinsics.px_from_rays(rays).reshape(len(v), len(u), 2)
+    rows, columns = (slice(side.start - 1, side.stop + 1) for side in tile)
+    shape = rows.stop - rows.start, columns.stop - columns.start
+    corner = np.array(
+        [grid.x_m - rows.start * grid.m_per_px, grid.y_m - columns.start * grid.m_per_px]
+    )
+    rotation = foot_from_cam(attitude.tilt_rad, attitude.roll_rad)
+    rays = rays_of_cells(corner, grid.m_per_px, shape, rotation, attitude.height_m, widest)
+    return camera.intrinsics.px_from_rays(rays).reshape(*shape, 2)
 
 
 def _seen(source_px: Floats, camera: Camera) -> Mask:
