@@ -1,11 +1,11 @@
-"""How a floor point appears in a frame of the bundle, with every derivative; numpy only.
+"""How a floor point appears in a frame of the bundle, with every derivative.
 
-The same camera as in `reprojection.py`, written out by components because it runs over all
-sightings at once. With tilt a, roll r, height h and the floor point q in `foot`, the camera sees
-X = -cos r qy + h sin r, Y = -cos a qx + sin r sin a qy + h cos r sin a,
-Z = sin a qx + sin r cos a qy + h cos r cos a, ray (X, Y) / Z; and with a focal length longer by the
-fraction f and a first distortion term larger by k, the ray (1 + g f) (1 + k |ray|^2) ray. The gain
-g is 1 for a pinhole; behind a distorting lens a ray grows by another multiple, a fisheye's by far.
+The same camera as in `reprojection.py`, written out by components in compiled loops. With tilt a,
+roll r, height h and the floor point q in `foot`, the camera sees X = -cos r qy + h sin r,
+Y = -cos a qx + sin r sin a qy + h cos r sin a, Z = sin a qx + sin r cos a qy + h cos r cos a, ray
+(X, Y) / Z; and with a focal length longer by the fraction f and a first distortion term larger by
+k, the ray (1 + g f) (1 + k |ray|^2) ray. The gain g is 1 for a pinhole; behind a distorting lens a
+ray grows by another multiple, a fisheye's by far.
 """
 
 from dataclasses import dataclass
@@ -13,8 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from groundfuse.backend.bundle_compiled import residuals_of
+from groundfuse.backend.bundle_rows_compiled import (
+    Lines,
+    Placed,
+    Sighted,
+    residuals_of,
+    write_lines,
+)
 from groundfuse.backend.bundle_tracks import Integers, Observations
+from groundfuse.backend.side_by_side import side_by_side
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -41,66 +48,18 @@ class State:
     point: Array
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class View:
-    """Some sightings as the model has them; all (n,), lengths in metres.
-
-    Attributes:
-        x: ray without lens corrections.
-        y: the same.
-        qx: floor point in `foot`.
-        qy: the same.
-        per_depth: 1 / Z; 0 where the point is behind the camera.
-        turn: cosine and sine of the heading.
-        tilt: cosine and sine.
-        roll: cosine and sine.
-        height: of the camera over the point.
-    """
-
-    x: Array
-    y: Array
-    qx: Array
-    qy: Array
-    per_depth: Array
-    turn: tuple[Array, Array]
-    tilt: tuple[Array, Array]
-    roll: tuple[Array, Array]
-    height: Array
+def placed(state: State, robot_of: Integers) -> Placed:
+    """List frames and floor points for the compiled loops."""
+    angles = np.column_stack([state.pose[:, 2], state.attitude[:, :2]])
+    turns = np.stack([np.cos(angles), np.sin(angles)], axis=2).reshape(-1, 6)
+    heights = np.ascontiguousarray(state.attitude[:, 2])
+    lenses = np.ascontiguousarray(state.shared[robot_of, 3:5])
+    return Placed(state.pose, turns, heights, lenses, state.point)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Derivatives:
-    """Derivatives of predicted rays; unknowns first, so that a frame's rows are a view.
-
-    Attributes:
-        by_frame: (6, n, 2) by a right perturbation of the pose, and by tilt, roll, height.
-        by_point: (3, n, 2) by the floor point.
-        by_lens: (2, n, 2) by focal length and distortion.
-    """
-
-    by_frame: Array
-    by_point: Array
-    by_lens: Array
-
-
-def view_of(seen: Observations, state: State, part: slice) -> View:
-    """Project the floor points of some sightings."""
-    frame, point = seen.frame[part], seen.point[part]
-
-    def turned(angle: Array) -> tuple[Array, Array]:
-        return np.cos(angle)[frame], np.sin(angle)[frame]
-
-    (turn_c, turn_s), tilt = turned(state.pose[:, 2]), turned(state.attitude[:, 0])
-    roll = turned(state.attitude[:, 1])
-    h = state.attitude[:, 2][frame] - state.point[:, 2][point]
-    dx = state.point[:, 0][point] - state.pose[:, 0][frame]
-    dy = state.point[:, 1][point] - state.pose[:, 1][frame]
-    qx, qy = turn_c * dx + turn_s * dy, turn_c * dy - turn_s * dx
-    leaning = roll[1] * qy + roll[0] * h
-    depth = tilt[1] * qx + tilt[0] * leaning
-    per = np.divide(1.0, depth, out=np.zeros_like(depth), where=depth > NEAR * h)
-    x, y = (roll[1] * h - roll[0] * qy) * per, (tilt[1] * leaning - tilt[0] * qx) * per
-    return View(x, y, qx, qy, per, (turn_c, turn_s), tilt, roll, h)
+def sighted(seen: Observations, part: slice) -> Sighted:
+    """List some sightings for the compiled loops."""
+    return Sighted(seen.frame[part], seen.point[part], seen.ray[part], seen.gain[part])
 
 
 def residuals(seen: Observations, state: State, robot_of: Integers) -> tuple[Array, Mask]:
@@ -109,53 +68,42 @@ def residuals(seen: Observations, state: State, robot_of: Integers) -> tuple[Arr
     The residual of such a point is 0.
     """
     result, unseen = np.empty((len(seen.frame), 2)), np.empty(len(seen.frame), dtype=np.bool_)
-    sightings = seen.frame, seen.point, seen.ray, seen.gain
-    angles = np.column_stack([state.pose[:, 2], state.attitude[:, :2]])
-    turns = np.stack([np.cos(angles), np.sin(angles)], axis=2).reshape(-1, 6)
-    lenses = np.ascontiguousarray(state.shared[robot_of, 3:5])
-    frames = state.pose, turns, np.ascontiguousarray(state.attitude[:, 2]), lenses
-    residuals_of(sightings, frames, state.point, NEAR, result, unseen)
+    at = placed(state, robot_of)
+
+    def compare(part: slice) -> None:
+        residuals_of(sighted(seen, part), at, NEAR, result[part], unseen[part])
+
+    side_by_side(compare, len(result))
     return result, unseen
 
 
-def derivatives(view: View) -> Derivatives:
-    """Differentiate the projection, lens corrections apart."""
-    x, y, per = view.x, view.y, view.per_depth
-    (turn_c, turn_s), (ca, sa), (cr, sr) = view.turn, view.tilt, view.roll
-    by_frame, by_point = np.empty((6, len(per), 2)), np.empty((3, len(per), 2))
-    by_qx, by_qy = np.empty((len(per), 2)), np.empty((len(per), 2))
-    by_qx[:, 0], by_qx[:, 1] = -x * sa * per, -(ca + y * sa) * per
-    by_qy[:, 0], by_qy[:, 1] = -(cr + x * sr * ca) * per, sr * (sa - y * ca) * per
-    by_frame[0], by_frame[1] = -by_qx, -by_qy
-    by_frame[2] = by_qx * view.qy[:, None] - by_qy * view.qx[:, None]
-    by_frame[3, :, 0], by_frame[3, :, 1] = x * y, 1.0 + y * y
-    by_frame[4, :, 0] = (sr * view.qy + cr * view.height) * per + ca * x * x
-    by_frame[4, :, 1] = x * (ca * y - sa)
-    by_frame[5, :, 0], by_frame[5, :, 1] = (sr - x * cr * ca) * per, cr * (sa - y * ca) * per
-    by_point[0] = by_qx * turn_c[:, None] - by_qy * turn_s[:, None]
-    by_point[1] = by_qx * turn_s[:, None] + by_qy * turn_c[:, None]
-    by_point[2] = -by_frame[5]
-    return Derivatives(by_frame, by_point, np.zeros_like(by_point[:2]))
+def derivatives(
+    seen: Observations, state: State, robot_of: Integers, factor: Array, *, size: int, lens: bool
+) -> Lines:
+    """Differentiate predicted rays.
 
+    Args:
+        seen: sightings.
+        state: where.
+        robot_of: (frames,) robot of each frame.
+        factor: (n,) of each sighting's derivatives.
+        size: unknowns of a floor point, 2 or 3.
+        lens: with those by focal length and distortion.
 
-def through_lens(ideal: Derivatives, view: View, shared: Array, gain: Array) -> Derivatives:
-    """Carry derivatives through focal length and distortion.
-
-    `shared` (n, 6) and the focal length's `gain` (n,) are each sighting's.
+    Returns:
+        (n, 2, 6) by a right perturbation of the pose, and by tilt, roll, height; (n, 2, size) by
+        the floor point; (n, 2, 2), or none, by focal length and distortion.
     """
-    ray = np.stack([view.x, view.y], axis=1)
-    focal, term = 1.0 + shared[:, 3:4] * gain[:, None], shared[:, 4:5]
-    radius2 = np.sum(ray * ray, axis=1, keepdims=True)
-    bulge = 1.0 + term * radius2
-    by_lens = np.stack([ray * bulge * gain[:, None], ray * focal * radius2])
-    factor, gain = focal * bulge, 2.0 * focal * term * ray
+    count, at = len(seen.frame), placed(state, robot_of)
+    shapes = (count, 2, 6), (count, 2, size), (count if lens else 0, 2, 2)
+    lines = Lines(*map(np.empty, shapes))
 
-    def carried(derivative: Array) -> Array:
-        along = derivative[:, :, 0] * ray[:, 0] + derivative[:, :, 1] * ray[:, 1]
-        through: Array = factor * derivative + gain * along[:, :, None]
-        return through
+    def differentiate(part: slice) -> None:
+        mine = Lines(*(of[part] for of in lines))
+        write_lines(sighted(seen, part), at, NEAR, factor[part], mine)
 
-    return Derivatives(carried(ideal.by_frame), carried(ideal.by_point), by_lens)
+    side_by_side(differentiate, count)
+    return lines
 
 
 @dataclass(frozen=True, slots=True, eq=False)

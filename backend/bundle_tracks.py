@@ -27,9 +27,6 @@ MIX = tuple(
     for number in (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9, 0xD6E8FEB86659FD93)
 )
 
-PIECE = 4096
-"""Sightings worked on at once: their derivatives, 0.4 MB, stay in the second-level cache."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sightings:
@@ -85,7 +82,6 @@ class Observations:
         pair_j: (m,) second observation.
         pair_key: (k,) frame_i * frames + frame_j of each pair of frames that share points.
         pair_start: (k + 1,) first pair of each.
-        parts: observations in pieces that fit a processor's cache, whole frames each.
     """
 
     frame: Integers
@@ -100,7 +96,6 @@ class Observations:
     pair_j: Integers
     pair_key: Integers
     pair_start: Integers
-    parts: tuple[slice, ...]
 
 
 def mixed_keys(number: Integers, ray: Array) -> Keys:
@@ -213,9 +208,6 @@ def observations(
         np.append(start, len(key)),
         np.searchsorted(frame, np.arange(num_frames + 1)),
     )
-    whole = [
-        slice(int(frame_start[p.start]), int(frame_start[p.stop])) for p in pieces(frame_start)
-    ]
     return Observations(
         frame,
         point,
@@ -229,17 +221,7 @@ def observations(
         pair_j[by_key],
         key[start],
         pair_start,
-        tuple(whole),
     )
-
-
-def pieces(start: Integers) -> tuple[slice, ...]:
-    """Cut a list of runs (k + 1 bounds) into slices of whole runs of about `PIECE` items."""
-    if len(start) < 2:
-        return ()
-    number = start[:-1] // PIECE
-    first = np.flatnonzero(np.append(True, number[1:] != number[:-1])).tolist()
-    return tuple(map(slice, first, [*first[1:], len(start) - 1]))
 
 
 def _pairs_within(point: Integers) -> tuple[Integers, Integers]:

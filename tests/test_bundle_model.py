@@ -12,8 +12,6 @@ from groundfuse.backend.bundle_model import (
     floor_points,
     moved,
     residuals,
-    through_lens,
-    view_of,
 )
 from groundfuse.backend.bundle_tracks import Sightings, observations
 from groundfuse.backend.measurement import Attitude, Se2
@@ -71,8 +69,9 @@ def test_derivatives_agree_with_the_transfer(pose, attitude, other, seed):
     rays_a = rays_from_floor(Attitude(*other), floor)
     good = np.isfinite(rays_a).all(axis=1) & (np.abs(rays_a) < 2.0).all(axis=1)
     expected = transfer(rays_a, np.array(other), np.array(pose), np.array(attitude))
-    found = derivatives(view_of(seen, state, slice(0, len(seen.frame))))
-    by_frame = found.by_frame.transpose(1, 2, 0)
+    found = derivatives(seen, state, ROBOT_OF, np.ones(len(seen.frame)), size=2, lens=False)
+    by_frame = found.by_frame
+    assert found.by_lens.size == 0
     scale = 1.0 + np.abs(by_frame[good])
     wanted = np.concatenate([expected.by_pose, expected.by_attitude_b], axis=2)[good]
     np.testing.assert_allclose(by_frame[good] / scale, wanted / scale, atol=1e-8)
@@ -82,9 +81,7 @@ def test_derivatives_agree_with_the_transfer(pose, attitude, other, seed):
 def test_derivatives_agree_with_differences(pose, attitude, lens, seed):
     seen, state = seen_from(pose, attitude, lens, seed)
     state.point[:, 2] = np.random.default_rng(seed).normal(0, 0.02, len(state.point))
-    whole = slice(0, len(seen.frame))
-    view = view_of(seen, state, whole)
-    found = through_lens(derivatives(view), view, state.shared[ROBOT_OF[seen.frame]], seen.gain)
+    found = derivatives(seen, state, ROBOT_OF, np.ones(len(seen.frame)), size=3, lens=True)
 
     def changed(node, axis, size):
         step = np.zeros((4, 6))
@@ -96,9 +93,9 @@ def test_derivatives_agree_with_differences(pose, attitude, lens, seed):
         step[:, axis] = size
         return residuals(seen, moved(state, np.zeros((4, 6)), step), ROBOT_OF)[0]
 
-    cases = [(found.by_frame[k], lambda s, k=k: changed(1, k, s)) for k in range(6)]
-    cases += [(found.by_lens[k], lambda s, k=k: changed(3, 3 + k, s)) for k in range(2)]
-    cases += [(found.by_point[k], lambda s, k=k: point_changed(k, s)) for k in range(3)]
+    cases = [(found.by_frame[:, :, k], lambda s, k=k: changed(1, k, s)) for k in range(6)]
+    cases += [(found.by_lens[:, :, k], lambda s, k=k: changed(3, 3 + k, s)) for k in range(2)]
+    cases += [(found.by_point[:, :, k], lambda s, k=k: point_changed(k, s)) for k in range(3)]
     for analytic, at in cases:
         numeric = (at(-STEP) - at(STEP)) / (2 * STEP)  # a residual falls as the prediction grows
         assert (np.abs(analytic - numeric) / (1 + np.abs(analytic)) < TOLERANCE_DERIVATIVE).all()

@@ -7,11 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from groundfuse.backend.bundle_tracks import (
-    PIECE,
     Links,
     Sightings,
     observations,
-    pieces,
     sightings_from_edges,
     single_links,
     tracks,
@@ -130,13 +128,3 @@ def test_single_links_share_nothing():
     used, point = single_links(links)
     assert used.tolist() == [4, 4, 5, 6]
     assert point.tolist() == [0, 1, 0, 1]
-
-
-@given(st.lists(st.integers(0, 3 * PIECE), max_size=20))
-def test_pieces_cover_whole_runs_in_order(sizes):
-    start = np.concatenate([[0], np.cumsum(np.array(sizes, dtype=np.int64))])
-    found = pieces(start)
-    assert [k for part in found for k in range(part.start, part.stop)] == list(range(len(sizes)))
-    for part in found:
-        first, last = start[part.start], start[part.stop - 1]
-        assert last - first < PIECE
