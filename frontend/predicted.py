@@ -5,13 +5,12 @@ long way through the graph connects, close a loop that retrieval did not find; a
 any pair of its own needs another. Where the graph is dense already, one more pair tells little.
 """
 
-from collections.abc import Collection, Mapping
+import functools
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
-from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
 from groundfuse.backend.measurement import Attitude, FrameId, Se2
@@ -24,8 +23,9 @@ from groundfuse.frontend.overhead_view import OverheadOptions, raster_cell_m
 Pair = tuple[FrameId, FrameId]
 Frames = set[FrameId]
 Graph = dict[FrameId, Frames]
-CHUNK = 20_000
-"""Pairs whose surroundings are compared at once."""
+Around = Callable[[FrameId], Frames]
+BALLS_KEPT = 4096
+"""Frames whose surroundings in the graph are remembered: some kilobytes each."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,11 +89,16 @@ def predicted_pairs(
             graph[a].add(b)
             graph[b].add(a)
     known, least = set(tried), options.least_overlap
+
+    def around(frame: FrameId) -> Frames:
+        return _ball(graph, frame, options)
+
+    once = functools.lru_cache(BALLS_KEPT)(around)
     # Edges are only ever added: what is held well now is held well later.
     weak = [
         pair
-        for pair in _apart(graph, _close_by(outlines, component_of), options)
-        if pair not in known
+        for pair in _close_by(outlines, component_of)
+        if pair not in known and not _held(graph, *pair, once, options)
     ]
     shares = [(_overlap(outlines[a], outlines[b]), a, b) for a, b in weak]
     shared = [(-share, a, b) for share, a, b in shares if share >= least]
@@ -101,7 +106,7 @@ def predicted_pairs(
     of_frame = dict.fromkeys(outlines, 0)
     for _, a, b in sorted(shared):
         full = max(of_frame[a], of_frame[b]) >= options.num_frames
-        if full or _held(graph, a, b, options):
+        if full or _held(graph, a, b, around, options):
             continue
         chosen.append((a, b))
         for one, other in ((a, b), (b, a)):
@@ -137,33 +142,10 @@ def _overlap(a: Points, b: Points) -> float:
     return cv2.intersectConvexConvex(one, other)[0] / smaller if smaller > 0.0 else 0.0
 
 
-def _apart(graph: Graph, pairs: list[Pair], options: PredictedOptions) -> list[Pair]:
-    """Return the pairs that `_held` is false of, all at once."""
-    place = {frame: number for number, frame in enumerate(graph)}
-    rows = [place[frame] for frame, others in graph.items() for _ in others]
-    columns = [place[other] for others in graph.values() for other in others]
-    size = len(graph)
-    here = np.arange(size)
-    ends = np.append(rows, here), np.append(columns, here)  # a frame is near itself too
-    ones = np.ones(len(ends[0]), dtype=np.bool_)
-    one = csr_array((ones, ends), shape=(size, size))
-    half: Any = csr_array((np.ones(size, dtype=np.bool_), (here, here)), shape=(size, size))
-    for _ in range(options.near_edges // 2):
-        half = half @ one
-    i, j = (np.array([place[pair[end]] for pair in pairs], dtype=np.int64) for end in (0, 1))
-    few = np.array([len(others) for others in graph.values()]) < options.least_pairs
-    weak = few[i] | few[j]
-    for start in range(0, len(pairs), CHUNK):
-        part = slice(start, start + CHUNK)
-        meet = half[i[part]].multiply(half[j[part]]).sum(axis=1)
-        weak[part] |= np.asarray(meet).ravel() == 0
-    return [pair for pair, is_weak in zip(pairs, weak.tolist(), strict=True) if is_weak]
-
-
-def _held(graph: Graph, a: FrameId, b: FrameId, options: PredictedOptions) -> bool:
+def _held(graph: Graph, a: FrameId, b: FrameId, around: Around, options: PredictedOptions) -> bool:
     """Whether two views have pairs enough, and a short way leads from one to the other."""
     few = min(len(graph[a]), len(graph[b])) < options.least_pairs
-    return not few and not _ball(graph, a, options).isdisjoint(_ball(graph, b, options))
+    return not few and not around(a).isdisjoint(around(b))
 
 
 def _ball(graph: Graph, middle: FrameId, options: PredictedOptions) -> Frames:

@@ -22,8 +22,8 @@ def test_rays_of_cells_are_rays_to_their_middles(tilt_rad, widest):
     v, u = np.divmod(np.arange(shape[0] * shape[1]), shape[1])
     expected = rays_from_floor(attitude, corner - cell_m * np.stack([v, u], axis=1))
     expected[~(np.hypot(*expected.T) <= widest)] = np.nan
-    # Rounding; where the ray is nearly along the floor it is as long as 1e3: worst seen 2e-12.
-    np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-14)
+    # Rounding of a depth that is nearly 0 where a ray is 3e5 long: worst seen 5e-12.
+    np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-14)
     seen = np.isfinite(found[:, 0])
     assert seen.any()
     assert seen.all() == (np.isinf(widest) and tilt_rad == 0.0)
