@@ -11,7 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from groundfuse.frontend.arrays import Image, Mask
-from groundfuse.frontend.mosaic_plan import MosaicOptions, MosaicPlan, MosaicView, plan_mosaic
+from groundfuse.frontend.kept_parts import Memory
+from groundfuse.frontend.mosaic_options import MosaicOptions
+from groundfuse.frontend.mosaic_plan import MosaicPlan, MosaicView, plan_mosaic
 from groundfuse.frontend.mosaic_stream import mosaic_tiles
 from groundfuse.frontend.mosaic_tile import Tile
 from groundfuse.frontend.selection import FEWEST_VIEWS
@@ -69,11 +71,14 @@ def build_mosaic(
 
 
 def planned_mosaic(
-    plan: MosaicPlan, options: MosaicOptions, progress: Callable[[int, int], None] | None = None
+    plan: MosaicPlan,
+    options: MosaicOptions,
+    progress: Callable[[int, int], None] | None = None,
+    memory: Memory | None = None,
 ) -> Mosaic:
-    """Carry out a plan whose cells fit into memory; see `build_mosaic`."""
+    """Carry out a plan whose cells fit into memory; see `build_mosaic` and `mosaic_tiles`."""
     layers = _blank_layers(plan)
-    for block, tile in mosaic_tiles(plan, options, progress):
+    for block, tile in mosaic_tiles(plan, options, progress, memory):
         layers.floor[block], layers.mean[block] = tile.floor, tile.mean
         layers.count[block] = tile.count
     return trimmed(plan.grid, layers)

@@ -6,7 +6,7 @@ import numpy as np
 
 from groundfuse.frontend.arrays import Image, Picture32
 from groundfuse.frontend.mosaic import Mosaic, trimmed
-from groundfuse.frontend.mosaic_stream import Block
+from groundfuse.frontend.mosaic_plan import Block
 from groundfuse.frontend.mosaic_tile import Tile
 from groundfuse.frontend.sight import Grid
 

@@ -8,9 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from groundfuse.frontend.ahead import in_order
-from groundfuse.frontend.exposure_samples import merged, sample_exposure, sampling_grid
-from groundfuse.frontend.gains import Exposure, Samples, estimate_exposure, neutral_exposure
-from groundfuse.frontend.mosaic_plan import Extent, MosaicOptions, MosaicPlan
+from groundfuse.frontend.exposure_samples import (
+    ViewSamples,
+    merged,
+    sample_exposure,
+    sampling_grid,
+)
+from groundfuse.frontend.gains import Exposure, estimate_exposure, neutral_exposure
+from groundfuse.frontend.kept_parts import Keeper, Memory
+from groundfuse.frontend.mosaic_options import MosaicOptions
+from groundfuse.frontend.mosaic_plan import Block, Extent, MosaicPlan
 from groundfuse.frontend.mosaic_tile import Tile, TileStack
 from groundfuse.frontend.picture_cache import Cache
 from groundfuse.frontend.pyramid import Pyramid, halvings, pyramid
@@ -19,8 +26,6 @@ from groundfuse.frontend.sight import Room, read_window, room_for, sight
 AHEAD_PER_WORKER = 3
 """Tiles being made or waiting to be taken, for each thread."""
 
-Block = tuple[slice, slice]
-"""Rows and columns of the grid."""
 Told = Callable[[int, int], None]
 """Is told how many steps of how many are done."""
 
@@ -33,6 +38,7 @@ class _Scene:
     pictures: Cache[Pyramid]
     exposure: Exposure
     options: MosaicOptions
+    keeper: Keeper
 
 
 class _Steps:
@@ -48,15 +54,22 @@ class _Steps:
 
 
 def mosaic_tiles(
-    plan: MosaicPlan, options: MosaicOptions, progress: Told | None = None
+    plan: MosaicPlan,
+    options: MosaicOptions,
+    progress: Told | None = None,
+    memory: Memory | None = None,
 ) -> Iterator[tuple[Block, Tile]]:
     """Yield all tiles that show any floor, always in the same order.
 
     Pictures are loaded when a tile needs them and held within a budget. Tiles that no view reaches
-    cost nothing.
+    cost nothing. A tile of an earlier mosaic is taken from the memory if it has the same views of
+    the same pictures, and none of them, as the tile was rendered with it, would move or change its
+    light by more than `keep_within_cells` and `keep_within_levels`; so are the samples that
+    exposures are estimated from. The others are rendered, and kept in their places.
 
     Raises:
-        ValueError: a picture of another size than its camera's.
+        ValueError: a picture of another size than its camera's; a memory, and no digest of a
+            picture.
     """
 
     def picture(number: int) -> Pyramid:
@@ -66,14 +79,14 @@ def mosaic_tiles(
     blocks = _blocks(plan, options.tile_cells)
     samplings = len(plan.extents) if options.compensate else 0
     told = _Steps(progress, samplings + len(blocks))
-    exposure = neutral_exposure(len(plan.views))
+    exposure, keeper = neutral_exposure(len(plan.views)), Keeper(plan, options, memory)
     with ThreadPoolExecutor(options.workers) as threads:
         if options.compensate:
-            exposure = _exposure(plan, threads, told)
-        scene = _Scene(plan, pictures, exposure, options)
+            exposure = _exposure(plan, keeper, threads, told)
+        scene = _Scene(plan, pictures, exposure, options, keeper)
 
         def work(item: tuple[Block, list[Extent]]) -> Tile | None:
-            return _tile(scene, *item)
+            return scene.keeper.tile(*item, exposure, lambda: _tile(scene, *item))
 
         ahead = AHEAD_PER_WORKER * options.workers
         for (block, _), tile in zip(blocks, in_order(threads, work, blocks, ahead), strict=True):
@@ -123,20 +136,24 @@ def _blocks(plan: MosaicPlan, side: int) -> list[tuple[Block, list[Extent]]]:
     ]
 
 
-def _exposure(plan: MosaicPlan, threads: ThreadPoolExecutor, told: _Steps) -> Exposure:
-    grid = sampling_grid(plan)
+def _exposure(
+    plan: MosaicPlan, keeper: Keeper, threads: ThreadPoolExecutor, told: _Steps
+) -> Exposure:
+    cell_m = sampling_grid(plan).m_per_px
 
-    def work(number: int) -> Samples:
-        picture = _picture(plan, plan.extents[number].view, grid.m_per_px)
-        return sample_exposure(plan, grid, number, picture)
+    def work(number: int) -> ViewSamples:
+        extent = plan.extents[number]
+        return keeper.samples(
+            extent, lambda: sample_exposure(plan, number, _picture(plan, extent.view, cell_m))
+        )
 
-    parts: list[Samples] = []
+    parts: list[ViewSamples] = []
     for part in threads.map(work, range(len(plan.extents))):
         parts.append(part)
         told.step()
     robots = sorted({view.frame.robot for view in plan.views})
     lens_of_view = np.array([robots.index(view.frame.robot) for view in plan.views])
-    return estimate_exposure(merged(parts), lens_of_view)
+    return estimate_exposure(merged(parts, [e.view for e in plan.extents]), lens_of_view)
 
 
 def _tile(scene: _Scene, block: Block, shown: list[Extent]) -> Tile | None:

@@ -20,6 +20,7 @@ from groundfuse.frontend.sight_compiled import fill_lattice, rays_of_lattice
 RAY_SLACK = 1.0 + 1e-9
 LINEAR_ERROR_CELLS = 0.02
 LARGEST_STEP = 8
+ROUNDING_CELLS = 1e-6
 NO_FALLOFF = np.zeros(3)
 
 
@@ -40,6 +41,11 @@ class Grid:
     m_per_px: float
     rows: int
     columns: int
+
+    @property
+    def first_cells(self) -> tuple[int, int]:
+        """Row and column of the first cell, counted in cells from the origin of the team."""
+        return round(-self.y_max_m / self.m_per_px), round(self.x_min_m / self.m_per_px)
 
     def part(self, rows: slice, columns: slice) -> "Grid":
         """Return some of the rows and columns as a grid of its own."""
@@ -112,7 +118,8 @@ def sight(
     Projected exactly are the middles of blocks of step x step cells; in between it is linear. A
     place in the picture bends by up to 2 / depth over the floor, so with cells of c m that errs by
     at most step^2 c / (4 depth) cells; `_step` keeps this within `LINEAR_ERROR_CELLS` for depths of
-    half the height and more. Blocks are counted from the grid's corner, whatever the part.
+    half the height and more. Blocks are counted from the team's origin, whatever the grid and the
+    part: where cells lie at whole multiples of their side, another grid's are seen the same.
 
     Args:
         camera: lens and used rows.
@@ -125,7 +132,9 @@ def sight(
     """
     rows, columns = part or (slice(0, grid.rows), slice(0, grid.columns))
     step = _step(grid.m_per_px / attitude.height_m)
-    first, last = (np.array([rows.start, columns.start]), np.array([rows.stop, columns.stop]) - 1)
+    origin = np.array(grid.first_cells)
+    first = np.array([rows.start, columns.start]) + origin
+    last = np.array([rows.stop, columns.stop]) + origin - 1
     first, last = first // step - 1, last // step + 1  # one block more, to interpolate to the edge
     px = _lattice_px(camera, attitude, team_from_foot, grid, step, first, last)
     shape = px.shape[0] - 2, px.shape[1] - 2
@@ -135,7 +144,7 @@ def sight(
     centre = lens.cx_px, lens.cy_px, half_diagonal_px(lens)
     fill_lattice(px, (*centre, *falloff.tolist()), step, (lattice, slopes, reading))
     limits = np.array([lens.width_px - 1.0, *camera.used_rows, limit_cells], np.float32)
-    first_row, first_column = (step * first).tolist()
+    first_row, first_column = (step * first - origin).tolist()
     return Sight(lattice, slopes, reading, step, first_row, first_column, limits)
 
 
@@ -150,10 +159,7 @@ def _lattice_px(
 ) -> Floats:
     """Pixels (n + 2, m + 2, 2) of the blocks from the first to the last, and one around them."""
     side_m = grid.m_per_px * step
-    corner = (
-        grid.x_min_m + (first[1] - 1 + 0.5) * side_m,
-        grid.y_max_m - (first[0] - 1 + 0.5) * side_m,
-    )
+    corner = (*(first - 1).tolist(), *_off_whole_cells_m(grid))
     rows, columns = (last - first + 3).tolist()
     rays = np.empty((rows * columns, 2))
     widest = widest_ray(camera) * RAY_SLACK
@@ -161,6 +167,14 @@ def _lattice_px(
     rays_of_lattice(matrix, corner, side_m, columns, widest * widest, rays)
     px: Floats = camera.intrinsics.px_from_rays(rays).reshape(rows, columns, 2)
     return px
+
+
+def _off_whole_cells_m(grid: Grid) -> tuple[float, float]:
+    """Return how far a grid's cells lie off whole multiples of their side: x and y, m."""
+    row, column = grid.first_cells
+    off = grid.x_min_m - column * grid.m_per_px, grid.y_max_m + row * grid.m_per_px
+    x_m, y_m = (0.0 if abs(m) < ROUNDING_CELLS * grid.m_per_px else m for m in off)
+    return x_m, y_m
 
 
 def cam_from_team(attitude: Attitude, team_from_foot: Se2) -> Matrix:

@@ -15,7 +15,7 @@ SLACK = 1e-6
 @compiled
 def rays_of_lattice(
     cam_from_team: Any,  # noqa: ANN401 - arrays, typed when compiled
-    corner: tuple[float, float],
+    corner: tuple[int, int, float, float],
     side_m: float,
     columns: int,
     widest2: float,
@@ -25,15 +25,16 @@ def rays_of_lattice(
 
     Args:
         cam_from_team: see `sight.cam_from_team`.
-        corner: x and y of the first point.
-        side_m: from one point to the next; x grows, and then y falls.
+        corner: row and column of the first block, counted from the origin, and x and y there.
+        side_m: of a block; x grows with columns, y falls with rows. The points are the middles.
         columns: points in a row.
         widest2: squared length of the longest ray.
         rays: to fill.
     """
-    m = cam_from_team
+    m, (first_row, first_column, x_m, y_m) = cam_from_team, corner
     for k in range(len(rays)):
-        x, y = corner[0] + (k % columns) * side_m, corner[1] - (k // columns) * side_m
+        x = x_m + (first_column + k % columns + 0.5) * side_m
+        y = y_m - (first_row + k // columns + 0.5) * side_m
         depth = m[2, 0] * x + m[2, 1] * y + m[2, 2]
         a = (m[0, 0] * x + m[0, 1] * y + m[0, 2]) / depth
         b = (m[1, 0] * x + m[1, 1] * y + m[1, 2]) / depth

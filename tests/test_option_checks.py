@@ -35,6 +35,8 @@ OFF_AT_0 = {
     "front_end.paper.segments.length_tolerance_ratio",
     "front_end.paper.segments.min_correlation",
     "more_looks",
+    "mosaic.keep_within_cells",
+    "mosaic.keep_within_levels",
     "team.max_cuts",
     "team.max_trials",
     "team.refine_below",

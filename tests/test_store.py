@@ -75,6 +75,23 @@ def test_without_a_path_it_lives_in_memory():
         assert store.load(b"k") is None
 
 
+def test_others_of_a_kind_are_forgotten_and_leave_room(path):
+    with Store(path) as store:
+        for k in range(9):
+            put(store, bytes(100_000), b"k%d" % k, "tile")
+        put(store, 1, b"k9", "number")
+    size = path.stat().st_size
+    with Store(path) as store:
+        store.forget_others("tile", {b"k3", b"k5", b"x"})
+        keys = {b"k%d" % k for k in range(10)}
+        assert store.known(keys) == {b"k3", b"k5", b"k9"}
+        for k in range(6):
+            put(store, bytes(100_000), b"m%d" % k, "tile")
+        store.forget_others("none", set())
+        assert len(store.known(keys)) == 3
+    assert path.stat().st_size <= size
+
+
 def test_fresh_starts_over(path):
     with Store(path) as store:
         put(store, 1)

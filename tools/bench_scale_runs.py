@@ -74,7 +74,8 @@ def grown(robots: Sequence[Robot], num_workers: int) -> Growth:
         out = Path(temporary)
         with Store(out / "store.sqlite") as store:
             fused = fuse_robots(robots, PipelineOptions(), num_workers, quiet, watch, store=store)
-        write_mosaics(out, fused, MosaicOptions(), num_workers, watch, quiet=True)
+            options = MosaicOptions()
+            write_mosaics(out, fused, options, num_workers, watch, quiet=True, store=store)
     truth = {frame: pose for robot in robots for frame, pose in (robot.truth or {}).items()}
     best = fused.best
     largest = {f: pose for f, pose in best.team_from_base.items() if best.component_of[f] == 0}

@@ -222,7 +222,7 @@ def _write_pictures(desk: _Desk, fused: Fused) -> set[str]:
 def _write_mosaics(desk: _Desk, fused: Fused) -> None:
     out, watch, options = desk.out, desk.watch, desk.options.mosaic
     quiet, num_workers = desk.asked.quiet, desk.asked.workers
-    mosaics = write_mosaics(out, fused, options, num_workers, watch, quiet=quiet)
+    mosaics = write_mosaics(out, fused, options, num_workers, watch, quiet=quiet, store=desk.store)
     with watch.stage("drawing"):
         write_location_graphs(out, fused, mosaics)
         for component, mosaic in mosaics.items():

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from groundfuse.frontend.mosaic_stream import Block
+from groundfuse.frontend.mosaic_plan import Block
 from groundfuse.frontend.mosaic_tile import Tile
 from groundfuse.frontend.sight import Grid
 from groundfuse.tools.errors import DataError

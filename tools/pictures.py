@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from groundfuse.backend.measurement import FrameId, Rejected, RelativePose
 from groundfuse.frontend.arrays import Image
+from groundfuse.frontend.kept_parts import Memory
 from groundfuse.frontend.mosaic import (
     Mosaic,
     MosaicOptions,
@@ -19,7 +20,7 @@ from groundfuse.frontend.mosaic import (
     build_mosaic,
     planned_mosaic,
 )
-from groundfuse.frontend.mosaic_plan import plan_mosaic
+from groundfuse.frontend.mosaic_plan import Layout, MosaicPlan, plan_mosaic
 from groundfuse.frontend.mosaic_preview import Preview, reduction
 from groundfuse.frontend.mosaic_stream import Told, mosaic_tiles
 from groundfuse.frontend.overhead_view import OverheadOptions, overhead_grid, overhead_view
@@ -27,8 +28,10 @@ from groundfuse.tools.drawing import draw_location_graph
 from groundfuse.tools.errors import TeamError
 from groundfuse.tools.files import write_atomic
 from groundfuse.tools.geotiff import BLOCK, can_write, new_geotiff
+from groundfuse.tools.mosaic_memory import MosaicMemory
 from groundfuse.tools.outputs import component_name
 from groundfuse.tools.pipeline import Fused, Stopwatch
+from groundfuse.tools.store import Store
 from groundfuse.tools.team_folder import load_image
 
 log = logging.getLogger(__name__)
@@ -45,13 +48,24 @@ def write_mosaics(
     watch: Stopwatch,
     *,
     quiet: bool,
+    store: Store | None = None,
 ) -> dict[int, Mosaic]:
     """Build and write the mosaic of every component with its layers; return them by component.
 
     A mosaic of more than `memory_cells` is written as a GeoTIFF, and what is returned and written
     as PNG is a reduced preview; without rasterio its cells are larger from the start.
+
+    Args:
+        out: folder.
+        fused: the team.
+        options: how.
+        num_workers: threads.
+        watch: takes the seconds.
+        quiet: without a progress bar.
+        store: has the tiles of the team's last mosaics, and takes these; see `mosaic_tiles`.
     """
     mosaics: dict[int, Mosaic] = {}
+    memory = None if store is None else MosaicMemory(store)
     for component in sorted(set(fused.best.component_of.values())):
         with (
             watch.stage("mosaic"),
@@ -65,22 +79,30 @@ def write_mosaics(
             name, views = component_name("mosaic", component), _views(fused, component)
             chosen = replace(options, workers=num_workers)
             try:
-                mosaic = _mosaic(out / f"{name}.tif", views, chosen, told)
+                kept = None if memory is None else memory.of(name)
+                mosaic = _mosaic(out / f"{name}.tif", views, chosen, told, kept)
             except ValueError as error:
                 raise TeamError(f"mosaic of component {component}: {error}") from error
         with watch.stage("writing"):
             _write_layers(out, name, mosaic, num_workers)
         mosaics[component] = mosaic
+    if memory is not None:
+        memory.forget_others()
     return mosaics
 
 
-def _mosaic(path: Path, views: Sequence[MosaicView], options: MosaicOptions, told: Told) -> Mosaic:
+def _mosaic(
+    path: Path,
+    views: Sequence[MosaicView],
+    options: MosaicOptions,
+    told: Told,
+    memory: Memory | None,
+) -> Mosaic:
     """Build a mosaic; one too large to be held goes to the GeoTIFF, and its preview comes back."""
     path.unlink(missing_ok=True)  # one of an earlier run is not this team's
-    plan = plan_mosaic(views, options)
-    cells = plan.grid.rows * plan.grid.columns
-    if cells <= options.memory_cells:
-        return planned_mosaic(plan, options, told)
+    plan = _plan(views, options, memory)
+    if plan.grid.rows * plan.grid.columns <= options.memory_cells:
+        return planned_mosaic(plan, options, told, memory)
     if not can_write():
         mosaic = build_mosaic(views, options, told)
         log.warning(
@@ -93,12 +115,24 @@ def _mosaic(path: Path, views: Sequence[MosaicView], options: MosaicOptions, tol
             mosaic.m_per_px,
         )
         return mosaic
+    options = replace(options, tile_cells=BLOCK)
+    plan = _plan(views, options, memory)
     preview = Preview(plan.grid, reduction(plan.grid, options.memory_cells, BLOCK))
     with new_geotiff(path, plan.grid) as file:
-        for block, tile in mosaic_tiles(plan, replace(options, tile_cells=BLOCK), told):
+        for block, tile in mosaic_tiles(plan, options, told, memory):
             file.add(block, tile)
             preview.add(block, tile)
         return preview.finished()
+
+
+def _plan(views: Sequence[MosaicView], options: MosaicOptions, memory: Memory | None) -> MosaicPlan:
+    """Lay out a mosaic as the one before it, where that fits."""
+    if memory is None:
+        return plan_mosaic(views, options)
+    earlier = memory.load("layout")
+    plan = plan_mosaic(views, options, earlier if isinstance(earlier, Layout) else None)
+    memory.save("layout", plan.layout)
+    return plan
 
 
 def _views(fused: Fused, component: int) -> list[MosaicView]:
@@ -109,7 +143,14 @@ def _views(fused: Fused, component: int) -> list[MosaicView]:
         return lambda: load_image(known, robot.camera)
 
     return [
-        MosaicView(frame, frames[frame][0].camera, fused.attitude(frame), pose, loader(frame))
+        MosaicView(
+            frame,
+            frames[frame][0].camera,
+            fused.attitude(frame),
+            pose,
+            loader(frame),
+            fused.front_end.pictures.get(frame, b""),
+        )
         for frame, pose in sorted(best.team_from_base.items())
         if best.component_of[frame] == component
     ]

@@ -12,7 +12,7 @@ import logging
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -137,6 +137,17 @@ class Store:
             if time.monotonic() - self._synced_s > SYNC_S:
                 self._base.execute("PRAGMA wal_checkpoint(PASSIVE)")
                 self._synced_s = time.monotonic()
+
+    def forget_others(self, kind: str, keys: Collection[bytes]) -> None:
+        """Remove all entries of a kind but those with these keys; others may take their room."""
+        find = "SELECT id, key FROM entry WHERE kind = ?"
+        with self._told(), self._guard:
+            found = self._base.execute(find, (kind,)).fetchall()
+            gone = [(number,) for number, key in found if key not in keys]
+            if gone:
+                self._base.execute("BEGIN")
+                self._base.executemany("DELETE FROM entry WHERE id = ?", gone)
+                self._base.execute("COMMIT")
 
     def kept(self, kind: str, label: str, parts: Sequence[object], work: Callable[[], Any]) -> Any:  # noqa: ANN401
         """Return what work gives, from the entry of its key where there is one.

@@ -1,0 +1,163 @@
+"""Tiles and samples of earlier mosaics, each with what it was made from.
+
+Whether a part is kept depends on its own record and on today's plan alone, and a part that is not
+kept is made from today's plan alone. So it does not matter whether some parts were renewed already
+by a run of the same plan that was interrupted: those are today's, and the others are kept or not
+as they would have been.
+"""
+
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from groundfuse.frontend.arrays import Floats
+from groundfuse.frontend.exposure_samples import ViewSamples
+from groundfuse.frontend.gains import Exposure, neutral_exposure
+from groundfuse.frontend.made_from import MadeFrom, is_same, made_from
+from groundfuse.frontend.mosaic_options import MosaicOptions
+from groundfuse.frontend.mosaic_plan import Block, Extent, MosaicPlan
+from groundfuse.frontend.mosaic_tile import Tile
+
+QUICK = 1
+"""Of zlib's levels."""
+
+
+class Memory(Protocol):
+    """Where the parts of a mosaic are kept, by name; threads use it at once."""
+
+    def load(self, name: str) -> object:
+        """Return what was saved last by that name; None where nothing was."""
+
+    def save(self, name: str, part: object) -> None:
+        """Keep a part in place of what had its name."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PackedTile:
+    """A tile in less memory: neighbours are alike, and so are floor and mean.
+
+    Attributes:
+        rows: of cells.
+        columns: of cells.
+        data: deflated differences of floor cells along the rows, of the mean and the floor, modulo
+            256, and the counts.
+    """
+
+    rows: int
+    columns: int
+    data: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeptTile:
+    """A finished tile, None where no view saw any of it, and what it was made from."""
+
+    made_from: MadeFrom
+    tile: PackedTile | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeptSamples:
+    """The samples of a view, and what they were made from."""
+
+    made_from: MadeFrom
+    samples: ViewSamples
+
+
+def packed_tile(tile: Tile) -> PackedTile:
+    """Pack a tile."""
+    along = tile.floor.copy()
+    along[:, 1:] -= tile.floor[:, :-1]
+    raw = along.tobytes() + (tile.mean - tile.floor).tobytes() + tile.count.tobytes()
+    rows, columns = tile.count.shape
+    return PackedTile(rows, columns, np.frombuffer(zlib.compress(raw, QUICK), np.uint8))
+
+
+def unpacked_tile(packed: PackedTile) -> Tile:
+    """Return what was packed."""
+    shape = packed.rows, packed.columns
+    raw = np.frombuffer(zlib.decompress(packed.data.tobytes()), np.uint8)
+    along, rest, count = np.split(raw, [3 * shape[0] * shape[1], 6 * shape[0] * shape[1]])
+    floor = np.add.accumulate(along.reshape(*shape, 3), axis=1, dtype=np.uint8)
+    mean = rest.reshape(*shape, 3) + floor
+    return Tile(floor, mean, count.view(np.uint16).reshape(shape))
+
+
+class Keeper:
+    """Makes only those parts of a mosaic that an earlier one does not have."""
+
+    def __init__(self, plan: MosaicPlan, options: MosaicOptions, memory: Memory | None) -> None:
+        """Take what the parts belong to; without a memory all are made.
+
+        Raises:
+            ValueError: there is a memory, and a view whose picture it can't know again.
+        """
+        self._plan, self._options, self._memory = plan, options, memory
+        for view in plan.views:
+            if memory is not None and not view.digest:
+                raise ValueError(f"a mosaic that is kept needs a digest of picture {view.frame}")
+
+    def samples(self, extent: Extent, work: Callable[[], ViewSamples]) -> ViewSamples:
+        """Return the samples of one view, made now if need be."""
+        if self._memory is None:
+            return work()
+        plan = self._plan
+        name, neutral = f"samples of {plan.views[extent.view].frame}", neutral_exposure(1)
+        settings = "samples", plan.grid.m_per_px, plan.layout.sampling_cells
+        one = np.zeros(len(plan.views), np.int64)  # whatever the view: samples have no gain
+        every = Exposure(neutral.log_gain[one], neutral.falloff[one], neutral.noise_levels)
+        today = made_from(plan, [extent.view], every, settings)
+        kept = self._memory.load(name)
+        part = extent.rows, extent.columns
+        if isinstance(kept, KeptSamples) and self._is_same(kept.made_from, today, [part]):
+            return kept.samples
+        found = work()
+        self._memory.save(name, KeptSamples(today, found))
+        return found
+
+    def tile(
+        self,
+        block: Block,
+        shown: Sequence[Extent],
+        exposure: Exposure,
+        work: Callable[[], Tile | None],
+    ) -> Tile | None:
+        """Return one tile, made now if need be.
+
+        Args:
+            block: its place in the grid.
+            shown: the views' parts of it.
+            exposure: of all views.
+            work: makes it.
+        """
+        if self._memory is None:
+            return work()
+        (row, column), grid = self._plan.grid.first_cells, self._plan.grid
+        side, options = self._options.tile_cells, self._options
+        at = row + block[0].start, column + block[1].start
+        settings = "tile", grid.m_per_px, at, side, options.max_depth, options.num_sigmas
+        today = made_from(self._plan, [extent.view for extent in shown], exposure, settings)
+        name = f"tile {at[0] // side} {at[1] // side}"
+        parts = [extent.within(*block) or block for extent in shown]
+        kept = self._memory.load(name)
+        if isinstance(kept, KeptTile) and self._is_same(kept.made_from, today, parts):
+            return None if kept.tile is None else unpacked_tile(kept.tile)
+        found = work()
+        self._memory.save(name, KeptTile(today, None if found is None else packed_tile(found)))
+        return found
+
+    def _is_same(self, kept: MadeFrom, today: MadeFrom, parts: Sequence[Block]) -> bool:
+        corners = np.stack([self._corners_m(*part) for part in parts])
+        return is_same(kept, today, corners, self._plan.grid.m_per_px, self._options)
+
+    def _corners_m(self, rows: slice, columns: slice) -> Floats:
+        """Return the corners (4, 2) of a block of cells."""
+        grid = self._plan.grid
+        x = grid.x_min_m + np.array([columns.start, columns.stop]) * grid.m_per_px
+        y = grid.y_max_m - np.array([rows.start, rows.stop]) * grid.m_per_px
+        corners: Floats = np.stack(np.meshgrid(x, y), axis=-1).reshape(4, 2)
+        return corners

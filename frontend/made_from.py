@@ -1,0 +1,181 @@
+"""What a part of a mosaic was made from, and whether today it would be made from the same.
+
+A team that grows by a picture moves all others by a little, most by thousandths of a cell. What is
+compared is always what a part was really rendered with, so small changes can't add up.
+"""
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from groundfuse.backend.measurement import Attitude, Se2
+from groundfuse.frontend.arrays import Floats, Matrix
+from groundfuse.frontend.camera import Intrinsics
+from groundfuse.frontend.gains import Exposure
+from groundfuse.frontend.gains_compiled import POWERS
+from groundfuse.frontend.mosaic_options import MosaicOptions
+from groundfuse.frontend.mosaic_plan import MosaicPlan
+from groundfuse.frontend.sight import cam_from_team
+
+MIDDLE_GREY = 128.0
+"""Level at which a change of a gain is told in levels."""
+RADII2 = np.linspace(0.0, 1.0, 5)
+"""Where falloffs are compared: squared distances from the middle, half diagonals."""
+LENS_PLACES = 9
+"""A side of the lattice on which lenses are compared."""
+
+Lens = tuple[Intrinsics, int, int]
+"""Projection, first and last used row."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MadeFrom:
+    """Everything that a part's colours depend on, view by view in their order.
+
+    Attributes:
+        settings: what must be the same.
+        who: frame and picture of each view, in words; must be the same.
+        lenses: of the views.
+        lens_of_view: (n,) numbers of the lenses.
+        place: (n, 6) x, y, theta of the floor point below the camera, tilt, roll, height; m, rad.
+        limit_m: (n,) longest useful footprint of a pixel; must be the same.
+        colour: (n, 6) logarithms of the gains and coefficients of the falloff.
+        noise_levels: see `Exposure`.
+    """
+
+    settings: tuple[object, ...]
+    who: tuple[str, ...]
+    lenses: tuple[Lens, ...]
+    lens_of_view: NDArray[np.int64]
+    place: Floats
+    limit_m: Floats
+    colour: Floats
+    noise_levels: float
+
+
+def made_from(
+    plan: MosaicPlan, views: Sequence[int], exposure: Exposure, settings: tuple[object, ...]
+) -> MadeFrom:
+    """Describe what a part is made from today.
+
+    Args:
+        plan: of the mosaic.
+        views: numbers of those that the part shows.
+        exposure: of all views.
+        settings: what else the part depends on.
+    """
+    chosen = [plan.views[number] for number in views]
+    lenses = [(view.camera.intrinsics, *view.camera.used_rows) for view in chosen]
+    distinct = tuple(dict.fromkeys(lenses))
+    feet = [(view.team_from_foot, view.attitude) for view in chosen]
+    place = [
+        (foot.x_m, foot.y_m, foot.theta_rad, seen.tilt_rad, seen.roll_rad, seen.height_m)
+        for foot, seen in feet
+    ]
+    return MadeFrom(
+        settings,
+        tuple(f"{v.frame.robot} {v.frame.index} {v.digest.hex()}" for v in chosen),
+        distinct,
+        np.array([distinct.index(lens) for lens in lenses], np.int64),
+        np.array(place, np.float64).reshape(-1, 6),
+        np.array([plan.limit_m[number] for number in views], np.float64),
+        np.hstack([exposure.log_gain[list(views)], exposure.falloff[list(views)]]),
+        exposure.noise_levels,
+    )
+
+
+def is_same(
+    kept: MadeFrom, today: MadeFrom, corners_m: Floats, cell_m: float, options: MosaicOptions
+) -> bool:
+    """Tell whether what was made from `kept` may stay where `today` is asked for.
+
+    Args:
+        kept: what the part was rendered with.
+        today: what it would be rendered with.
+        corners_m: (n, 4, 2) corners of what each view shows of the part.
+        cell_m: side of a cell.
+        options: how much may change.
+    """
+    same = (
+        kept.settings == today.settings
+        and kept.who == today.who
+        and np.array_equal(kept.limit_m, today.limit_m)
+    )
+    return (
+        same
+        and _is_same_place(kept, today, corners_m, options.keep_within_cells * cell_m)
+        and _is_same_colour(kept, today, options)
+    )
+
+
+def _is_same_place(kept: MadeFrom, today: MadeFrom, corners_m: Floats, allowed_m: float) -> bool:
+    lenses = [
+        (kept.lenses[old], today.lenses[new])
+        for old, new in zip(kept.lens_of_view, today.lens_of_view, strict=True)
+    ]
+    if np.array_equal(kept.place, today.place) and all(old == new for old, new in lenses):
+        return True
+    bent_m = np.array([_lens_shift_px(*pair) for pair in lenses]) * today.limit_m
+    moved_m = floor_shift_m(kept.place, today.place, corners_m) + bent_m
+    return bool((moved_m <= allowed_m).all()) and allowed_m > 0.0
+
+
+def _is_same_colour(kept: MadeFrom, today: MadeFrom, options: MosaicOptions) -> bool:
+    allowed = options.keep_within_levels
+    powers = RADII2[:, None] ** np.arange(1, POWERS + 1)
+    gain, falloff = np.hsplit(today.colour - kept.colour, [3])
+    change = np.abs(gain[:, None, :] + (falloff @ powers.T)[:, :, None])
+    sigmas = options.num_sigmas if np.isfinite(options.num_sigmas) else 0.0
+    noise = abs(today.noise_levels - kept.noise_levels) * sigmas
+    return max(float(change.max(initial=0.0)) * MIDDLE_GREY, noise) <= allowed
+
+
+def floor_shift_m(kept: Floats, today: Floats, points_m: Floats) -> Floats:
+    """Return how far (n,) points of the floor (n, m, 2) move at most between two placings.
+
+    What one placing shows at a point, the other shows where the same ray meets the floor: a
+    homography near the identity.
+
+    Args:
+        kept: (n, 6) see `MadeFrom`.
+        today: likewise.
+        points_m: in the team's frame.
+    """
+    homogeneous = np.concatenate([points_m, np.ones((*points_m.shape[:2], 1))], axis=2)
+    rays = homogeneous @ _cams_from_team(kept).transpose(0, 2, 1)
+    found = np.linalg.solve(_cams_from_team(today), rays.transpose(0, 2, 1)).transpose(0, 2, 1)
+    moved = found[..., :2] / found[..., 2:] - points_m
+    farthest: Floats = np.hypot(moved[..., 0], moved[..., 1]).max(axis=1)
+    return farthest
+
+
+def _cams_from_team(places: Floats) -> Floats:
+    matrices: Floats = np.stack([_cam_from_team(*place) for place in places.tolist()])
+    return matrices
+
+
+@functools.lru_cache(maxsize=16_384)
+def _cam_from_team(
+    x_m: float, y_m: float, theta_rad: float, tilt_rad: float, roll_rad: float, height_m: float
+) -> Matrix:
+    """Each view takes part in many tiles."""
+    return cam_from_team(Attitude(tilt_rad, roll_rad, height_m), Se2(x_m, y_m, theta_rad))
+
+
+@functools.lru_cache(maxsize=256)
+def _lens_shift_px(kept: Lens, today: Lens) -> float:
+    """Return how far a ray's pixel moves at most; inf where the lenses differ in more than that."""
+    (old, *old_rows), (new, *new_rows) = kept, today
+    size = old.width_px, old.height_px
+    if kept == today:
+        return 0.0
+    if old_rows != new_rows or size != (new.width_px, new.height_px) or old.model != new.model:
+        return float("inf")
+    u = np.linspace(0.0, old.width_px - 1.0, LENS_PLACES)
+    v = np.linspace(old_rows[0], old_rows[1], LENS_PLACES)
+    px = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    shift = np.hypot(*(new.px_from_rays(old.rays_from_px(px)) - px).T)
+    return float(shift.max()) if np.isfinite(shift).all() else float("inf")
