@@ -4,12 +4,14 @@ import numpy as np
 from analytic_floor import centres, make_camera, ring, rounded, view_of, waves
 
 from groundfuse.backend.measurement import FrameId, Se2
+from groundfuse.frontend import gains
 from groundfuse.frontend.gains import (
     Samples,
     estimate_exposure,
     neutral_exposure,
     radius_squared,
 )
+from groundfuse.frontend.gains_compiled import distances
 from groundfuse.frontend.mosaic import MosaicOptions, build_mosaic
 
 # Samples are good to 2 % each, some 300 per view; 20 % of them are of obstacles.
@@ -48,6 +50,57 @@ def test_gains_and_falloffs_are_found_among_obstacles():
         # A constant may hide in the gains of all views of a lens.
         difference = shape - expected
         assert np.abs(difference - difference.mean()).max() < 2 * TOLERANCE_LOG_GAIN
+
+
+def test_the_solution_is_that_of_least_squares_with_every_cells_colour():
+    """The third lens shares no floor; nothing is eliminated, and there are two priors."""
+    rng = np.random.default_rng(8)
+    samples = made_samples(rng, rng.normal(0, 0.2, (VIEWS, 3)), rng.normal(0, 0.2, (2, 3)))
+    order = np.argsort(samples.cell, kind="stable")[:400]
+    view, lens = samples.view[order], samples.view[order] % 2
+    _, cell, number = np.unique(samples.cell[order], return_inverse=True, return_counts=True)
+    values, radius2 = np.log(samples.colour[order]), samples.radius2[order]
+    weight = rng.uniform(0.1, 1.0, len(view))
+    begins = np.append(0, np.cumsum(number))
+    floor = gains._Floor(view, lens, radius2, values, begins)
+    gain, falloff = gains._solve(floor, weight, VIEWS, 3)
+
+    size = VIEWS + 9 + len(number)
+    design = np.zeros((len(view), size))
+    rows = np.arange(len(view))
+    design[rows, view] = 1.0
+    design[rows, VIEWS + 9 + cell] = 1.0
+    for i in range(3):
+        design[rows, VIEWS + 3 * lens + i] = radius2 ** (i + 1)
+    prior = np.zeros(size)
+    prior[:VIEWS] = gains.GAIN_PRIOR * np.maximum(np.bincount(view, weight, VIEWS), 1.0)
+    prior[VIEWS : VIEWS + 9] = gains.FALLOFF_PRIOR
+    normal = design.T @ (weight[:, None] * design) + np.diag(prior)
+    mean = np.linalg.solve(normal, design.T @ (weight * values.mean(axis=1)))
+    expected = mean[VIEWS : VIEWS + 9].reshape(3, 3)
+    # Two ways of elimination, of a matrix whose condition is about 1e5: 1e5 x 2.2e-16 x 20.
+    np.testing.assert_allclose(falloff, expected, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(gain.mean(axis=1), mean[:VIEWS], rtol=0.0, atol=1e-9)
+    fall = design[:, VIEWS : VIEWS + 9] @ expected.ravel()
+    others = np.r_[:VIEWS, VIEWS + 9 : size]
+    right = design[:, others].T @ (weight[:, None] * (values - fall[:, None]))
+    each = np.linalg.solve(normal[np.ix_(others, others)], right)
+    np.testing.assert_allclose(gain, each[:VIEWS], rtol=0.0, atol=1e-9)
+
+
+def test_distances_are_from_the_weighted_mean_of_a_cell():
+    rng = np.random.default_rng(9)
+    view, lens = np.arange(20) % 5, np.arange(20) % 5 % 2
+    radius2, values = rng.random(20), rng.normal(0, 1, (20, 3))
+    weight, gain, falloff = rng.uniform(0.1, 1, 20), rng.normal(0, 1, (5, 3)), rng.random((2, 3))
+    found = np.empty(20)
+    begins = np.array([0, 2, 7, 20])
+    distances((view, lens, radius2, values), begins, weight, gain, falloff, found)
+    fall = (falloff[lens] * radius2[:, None] ** np.array([1, 2, 3])).sum(axis=1)
+    rest = values - gain[view] - fall[:, None]
+    for part in np.split(np.arange(20), begins[1:-1]):
+        away = rest[part] - np.average(rest[part], axis=0, weights=weight[part])
+        np.testing.assert_allclose(found[part], np.sqrt((away**2).mean(axis=1)), rtol=1e-12)
 
 
 def test_noise_is_that_of_one_view():
