@@ -23,6 +23,11 @@ TURNING_LEVEL = 4
 SIZES = 2
 """Sizes, each 1.2 times the next, at which corners are looked for: an overhead view has one scale,
 and what heights and wobble add to it is less than the second size."""
+BAND_PX, BANDS_APART = 16, 8
+"""Rows of a band of a view, and every how many of them one is looked at beforehand."""
+ENOUGH = 2.0
+"""Corners per corner asked for that a threshold leaves. ORB looks at twice what it is asked for, at
+little more than half of that in the larger size; what is over is for bands unlike the rest."""
 MOST = 3.2
 """Brighter and darker than this many local standard deviations is cut: lamps, holes."""
 
@@ -112,7 +117,9 @@ def corners(flat: Image, inner: Mask, wanted: int, least_grey: float, cell_px: i
         least_grey: grey values by which a corner's arc differs at least.
         cell_px: side of the cells over which they are spread.
     """
-    orb = cv2.ORB.create(nfeatures=2 * wanted + 1, fastThreshold=round(least_grey), nlevels=SIZES)
+    asked = 2 * wanted + 1
+    least = least_that_matters(flat, inner, asked, round(least_grey))
+    orb = cv2.ORB.create(nfeatures=asked, fastThreshold=least, nlevels=SIZES)
     many = orb.detect(flat, inner.astype(np.uint8))
     points = _points(many)
     strength = np.array([k.response for k in many], dtype=np.float64)
@@ -123,6 +130,42 @@ def corners(flat: Image, inner: Mask, wanted: int, least_grey: float, cell_px: i
         np.radians(np.array([k.angle for k in kept], dtype=np.float64)),
         np.zeros((0, 32), np.uint8) if bits is None else np.asarray(bits, dtype=np.uint8),
     )
+
+
+def least_that_matters(flat: Image, inner: Mask, asked: int, least_grey: int) -> int:
+    """Return the threshold above which a view has as many corners as ORB looks at.
+
+    Of those that pass, ORB looks only at the ones whose arcs differ most, twice as many as it is
+    asked for. So where a lively floor has far more, a higher threshold finds the same in less time;
+    how many there are is seen from some bands of rows.
+
+    Args:
+        flat: (rows, columns) view in grey values.
+        inner: (rows, columns) where corners may lie.
+        asked: corners that ORB is asked for.
+        least_grey: threshold that is never gone below.
+    """
+    apart = BANDS_APART * BAND_PX
+    bands = [
+        _arcs(flat, inner, k, least_grey) for k in range(apart // 2, len(flat) - apart // 2, apart)
+    ]
+    arcs = np.concatenate([np.zeros(0), *bands])
+    enough = round(ENOUGH * asked / BANDS_APART)
+    if len(arcs) <= enough:
+        return least_grey
+    return int(np.partition(arcs, -enough)[-enough])
+
+
+def _arcs(flat: Image, inner: Mask, first: int, least_grey: int) -> Floats:
+    """Return by how much the arcs differ at the corners of a band of rows, grey values (n,)."""
+    beside = 4  # a corner's arc, and that of the pixel next to it, which may be the better one
+    band = flat[first - beside : first + BAND_PX + beside]
+    found = cv2.FastFeatureDetector.create(least_grey).detect(band)
+    u, v = np.rint(_points(found)).astype(np.int64).T
+    strength = np.array([k.response for k in found], dtype=np.float64)
+    counts = (v >= beside) & (v < BAND_PX + beside) & inner[first - beside + v, u]
+    arcs: Floats = strength[counts]
+    return arcs
 
 
 def _points(keypoints: Sequence[cv2.KeyPoint]) -> Points:

@@ -2,6 +2,7 @@
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from groundfuse.frontend.describe_compiled import descriptors, orientations
 from groundfuse.frontend.extrema_compiled import BORDER_PX, find_extrema, located
-from groundfuse.frontend.keypoints import blobs, strongest
+from groundfuse.frontend.keypoints import SIZES, blobs, least_that_matters, strongest
 from groundfuse.frontend.scale_space import STEPS, scale_space, sigma_px
 
 SIDE = 96
@@ -145,3 +146,36 @@ def test_the_strongest_are_kept_in_order():
     np.testing.assert_array_equal(strongest(np.array([1.0, 5.0, 3.0, 5.0, 2.0]), 3), [1, 2, 3])
     np.testing.assert_array_equal(strongest(np.array([7.0, 7.0, 7.0]), 2), [0, 1])
     np.testing.assert_array_equal(strongest(np.array([7.0]), 2), [0])
+
+
+def grey_noise(seed, deviation, shape=(420, 500)):
+    noise = gaussian_filter(np.random.default_rng(seed).standard_normal(shape), 1.2)
+    return np.clip(128.0 + deviation * noise / noise.std(), 0, 255).astype(np.uint8)
+
+
+def orb_corners(flat, asked, threshold):
+    found = cv2.ORB.create(nfeatures=asked, fastThreshold=threshold, nlevels=SIZES).detect(flat)
+    return {(*k.pt, k.octave) for k in found}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_lively_view_gets_a_higher_threshold_and_the_same_corners(seed):
+    flat, asked = grey_noise(seed, 45.0), 501
+    least = least_that_matters(flat, np.ones(flat.shape, np.bool_), asked, 20)
+    assert least > 40
+    low, high = (orb_corners(flat, asked, threshold) for threshold in (20, least))
+    assert len(low) == asked
+    assert low == high
+    # It is not needlessly low: a higher one would lose corners.
+    assert orb_corners(flat, asked, 2 * least) != low
+
+
+def test_a_dull_view_or_one_of_little_floor_keeps_the_threshold():
+    dull, lively = grey_noise(0, 6.0), grey_noise(0, 45.0)
+    whole, little = np.ones(dull.shape, np.bool_), np.zeros(dull.shape, np.bool_)
+    little[:, :20] = True
+    assert least_that_matters(dull, whole, 501, 20) == 20
+    assert least_that_matters(lively, little, 501, 20) == 20
+    assert least_that_matters(lively, whole, 501, 90) == 90
+    assert least_that_matters(np.full((30, 40), 7, np.uint8), whole[:30, :40], 501, 20) == 20
+    assert least_that_matters(np.full_like(dull, 7), whole, 501, 20) == 20
