@@ -16,7 +16,7 @@ import itertools
 import json
 import math
 import struct
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from typing import Any
 
@@ -25,6 +25,7 @@ import numpy as np
 CHECKSUM_BYTES = 8
 STEP_BYTES = 64
 OURS = "groundfuse."
+PLAIN = frozenset({type(None), bool, int, float, str})
 
 
 class DamagedError(ValueError):
@@ -101,35 +102,47 @@ def _after(length: int) -> int:
     return -(-length // STEP_BYTES) * STEP_BYTES
 
 
-def _outline(value: object, arrays: _Arrays) -> Any:  # noqa: ANN401
+def _outline(value: Any, arrays: _Arrays) -> Any:  # noqa: ANN401, PLR0911
     """Return a value as JSON has it; lists begin with a letter for what they are."""
+    kind: Any = type(value)
+    if kind in PLAIN:  # most are: thousands of keys are made a run
+        return value
+    if kind is bytes:
+        return ["B", value.hex()]
+    if kind is tuple or kind is list:
+        return ["T", *[_outline(part, arrays) for part in value]]
     if isinstance(value, enum.Enum):
-        return ["E", _name(value), value.value]
-    if value is None or isinstance(value, bool | int | float | str):
+        return ["E", _name(kind), value.value]
+    if isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, np.ndarray):
         return ["A", value.dtype.str, list(value.shape), arrays.add(value)]
-    if isinstance(value, bytes):
-        return ["B", value.hex()]
-    return [*_lead(value), *(_outline(part, arrays) for part in _parts(value))]
-
-
-def _lead(value: object) -> list[str]:
     if isinstance(value, Mapping):
-        return ["D"]
-    if isinstance(value, tuple | list) and not hasattr(value, "_fields"):
-        return ["T"]
-    return ["O", _name(value)]
+        inner = itertools.chain.from_iterable(value.items())
+        return ["D", *[_outline(part, arrays) for part in inner]]
+    name, parts = _name(kind), (getattr(value, word) for word in _words(kind))
+    return ["O", name, *[_outline(part, arrays) for part in parts]]
 
 
-def _name(value: object) -> str:
+@functools.cache
+def _name(kind: type) -> str:
     """Return where a value's class lies: `frontend.fit:Prior`."""
-    kind = type(value)
     if not kind.__module__.startswith(OURS):
         raise TypeError(f"a {kind.__name__} can't be packed")
     return f"{kind.__module__.removeprefix(OURS)}:{kind.__name__}"
+
+
+@functools.cache
+def _words(kind: Any) -> tuple[str, ...]:  # noqa: ANN401
+    """Return the names of what a value of a class holds."""
+    if is_dataclass(kind):
+        return tuple(field.name for field in fields(kind))
+    words: tuple[str, ...] | None = getattr(kind, "_fields", None)
+    if words is None:
+        raise TypeError(f"a {kind.__name__} can't be packed")
+    return words
 
 
 @functools.cache
@@ -147,29 +160,20 @@ def _kind(name: str) -> Callable[..., Any]:
     return kind
 
 
-def _parts(value: object) -> Iterable[object]:
-    if isinstance(value, Mapping):
-        return itertools.chain.from_iterable(value.items())
-    if isinstance(value, tuple | list):
-        return value
-    if is_dataclass(value):
-        return (getattr(value, field.name) for field in fields(value))
-    raise TypeError(f"a {type(value).__name__} can't be packed")
-
-
 def _value(outline: Any, arrays: memoryview) -> Any:  # noqa: ANN401, PLR0911
     """Return what an outline describes; sequences come back as tuples."""
-    if not isinstance(outline, list):
+    if type(outline) is not list:
         return outline
     kind, *parts = outline
+    if kind == "O":
+        name, *inner = parts
+        return _kind(name)(*[_value(part, arrays) for part in inner])
     if kind == "A":
         return _array(arrays, *parts)
     if kind == "B":
         return bytes.fromhex(parts[0])
     if kind == "E":
         return _kind(parts[0])(parts[1])
-    if kind == "O":
-        return _kind(parts[0])(*(_value(part, arrays) for part in parts[1:]))
     inner = [_value(part, arrays) for part in parts]
     if kind == "D":
         return dict(zip(inner[::2], inner[1::2], strict=True))
