@@ -2,7 +2,7 @@
 
 import hashlib
 import itertools
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,9 +11,9 @@ from groundfuse.backend.measurement import FrameId
 from groundfuse.backend.option_checks import check_numbers
 from groundfuse.frontend.features import Features
 from groundfuse.frontend.predicted import Pair, PredictedOptions
-from groundfuse.frontend.retrieval import RetrievalOptions, retrieved
+from groundfuse.frontend.retrieval import Memory, RetrievalOptions, retrieved
 
-__all__ = ["Pair", "PairOptions", "neighbour_pairs", "retrieved_pairs", "skip_pairs"]
+__all__ = ["Pair", "PairOptions", "neighbour_pairs", "retrieved_pairs", "sample_of", "skip_pairs"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,19 +41,44 @@ def neighbour_pairs(frames: Sequence[FrameId]) -> list[Pair]:
     return [(a, b) for a, b in itertools.pairwise(order) if a.robot == b.robot]
 
 
-def retrieved_pairs(features: Mapping[FrameId, Features], options: PairOptions) -> list[Pair]:
+def sample_of(frames: Iterable[FrameId], options: RetrievalOptions) -> list[FrameId]:
+    """Return the frames that retrieval learns from, in order.
+
+    The sample stays nearly the same when frames are added.
+    """
+    return sorted(sorted(frames, key=_lot)[: options.num_sample])
+
+
+def retrieved_pairs(
+    features: Mapping[FrameId, Features], options: RetrievalOptions, memory: Memory | None = None
+) -> list[Pair]:
     """Return pairs that look alike, anywhere in the team.
 
-    What is learned from stays nearly the same when frames are added, so old pairs do too.
+    Args:
+        features: of every frame.
+        options: see there.
+        memory: of what was worked out before for these frames in order.
     """
     order = sorted(features)
-    sample = sorted(sorted(order, key=_lot)[: options.retrieval.num_sample])
     names = sorted({frame.robot for frame in order})
     robots = np.array([names.index(frame.robot) for frame in order], dtype=np.int64)
-    found = retrieved(
-        (features[f] for f in order), (features[f] for f in sample), options.retrieval, robots
-    )
+    sample = (features[frame] for frame in sample_of(order, options))
+    found = retrieved(_InOrder(features, order), sample, options, robots, memory)
     return [(order[i], order[j]) for i, j in found]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _InOrder:
+    """The features of frames by their places."""
+
+    features: Mapping[FrameId, Features]
+    order: Sequence[FrameId]
+
+    def __len__(self) -> int:
+        return len(self.order)
+
+    def __getitem__(self, place: int, /) -> Features:
+        return self.features[self.order[place]]
 
 
 def _lot(frame: FrameId) -> bytes:

@@ -9,19 +9,26 @@ not grow with the number of frames. Frames of other robots are asked apart: a ro
 fro sees its own floor in more frames than any list holds, and those look more alike.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from groundfuse.backend.option_checks import check_numbers
 from groundfuse.frontend.features import Features
+from groundfuse.frontend.retrieval_votes import (
+    Cast,
+    Indices,
+    Short,
+    Votes,
+    candidates,
+    cast,
+    counted,
+    most_similar,
+)
 
-Short = NDArray[np.float32]
-Indices = NDArray[np.int64]
-CHUNK = 256
-"""Frames whose likeness to all others is held at a time."""
 ROUNDS = 10
 """Of moving words to the middle of what is nearest to them."""
 
@@ -79,19 +86,63 @@ class Vocabulary:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Votes:
-    """Votes between frames, each pair once, in order.
+class Described:
+    """What is kept of one frame, some 27 kB.
 
     Attributes:
-        pairs: (m, 2) indices i < j.
-        weight: (m,) above 0, of both directions.
-        stranger: (n,) what each frame gives the lower quarter of its candidates; 0 where they are
-            all there are and none was chosen.
+        rows: (num_features, c) the largest features' components, zeros where it has fewer.
+        glance: (k c,) what its features leave over beside the words, to unit length.
     """
 
-    pairs: Indices
-    weight: NDArray[np.float64]
-    stranger: NDArray[np.float64]
+    rows: Short
+    glance: Short
+
+
+class Frames(Protocol):
+    """Features of frames by their places, each fetched when it is asked for."""
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+        ...
+
+    def __getitem__(self, place: int, /) -> Features:
+        """Return those of a frame."""
+        ...
+
+
+class Memory(Protocol):
+    """Gives what `work` gives, from before where it is known what that was."""
+
+    def vocabulary(self, work: Callable[[], Vocabulary | None]) -> Vocabulary | None:
+        """Return what the sample taught."""
+        ...
+
+    def described(self, work: Callable[[int], Described]) -> Iterable[Described]:
+        """Return what is kept of every frame, which the vocabulary says too."""
+        ...
+
+    def cast(self, near: Sequence[Indices], work: Callable[[int], Cast]) -> list[Cast]:
+        """Return every frame's votes for its candidates `near`, which depend on their looks."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Forgetful:
+    """Works everything out anew, for so many frames."""
+
+    count: int
+
+    def vocabulary(self, work: Callable[[], Vocabulary | None]) -> Vocabulary | None:
+        """Learn it."""
+        return work()
+
+    def described(self, work: Callable[[int], Described]) -> Iterable[Described]:
+        """Describe every frame."""
+        return map(work, range(self.count))
+
+    def cast(self, near: Sequence[Indices], work: Callable[[int], Cast]) -> list[Cast]:
+        """Let every frame vote."""
+        return list(map(work, range(len(near))))
 
 
 def learned(sample: Iterable[Features], options: RetrievalOptions) -> Vocabulary | None:
@@ -107,40 +158,41 @@ def learned(sample: Iterable[Features], options: RetrievalOptions) -> Vocabulary
     return Vocabulary(mean, leading, _words(_unit(centred @ leading), options.num_words))
 
 
-def described(frames: Iterable[Features], known: Vocabulary, options: RetrievalOptions) -> Short:
-    """Return what is kept of each frame: the largest features' components (n, num_features, c).
-
-    Frames are read once, one after the other: they need not be in memory together; some 19 kB each.
-    """
-    kept = [_padded(known.reduced(_largest(f, options.num_features)), options) for f in frames]
-    shape = (len(kept), options.num_features, known.words.shape[1])
-    return np.array(kept, dtype=np.float32).reshape(shape)
+def described(features: Features, known: Vocabulary, options: RetrievalOptions) -> Described:
+    """Return what is kept of a frame: the largest features' components, and a glance at them."""
+    rows = _padded(known.reduced(_largest(features, options.num_features)), options)
+    return Described(rows, _glance(rows, known.words))
 
 
 def votes(
-    short: Short, known: Vocabulary, options: RetrievalOptions, robots: Indices | None = None
+    short: Short,
+    glances: Short,
+    options: RetrievalOptions,
+    robots: Indices | None = None,
+    memory: Memory | None = None,
 ) -> Votes:
-    """Let every frame's features vote: for all others, or for those of other `robots` (n,)."""
-    near = _candidates(short, known.words, options.num_candidates, robots)
-    if not any(len(frames) for frames in near):
-        return Votes(np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(len(short)))
-    cast = [_cast(short, i, near[i], options.num_votes) for i in range(len(short))]
-    chosen = [len(votes) == options.num_candidates for votes in cast]
-    stranger = [np.quantile(v, 0.25) if c else 0.0 for v, c in zip(cast, chosen, strict=True)]
-    voter = np.repeat(np.arange(len(near)), [len(frames) for frames in near])
-    ends, every = np.column_stack([voter, np.concatenate(near)]), np.concatenate(cast)
-    pairs, weight = _summed(ends[every > 0.0], every[every > 0.0], len(short))
-    return Votes(pairs, weight, np.array(stranger))
+    """Let every frame's features vote: for all others, or for those of other `robots` (n,).
+
+    Args:
+        short: (n, num_features, c) rows of all frames.
+        glances: (n, k c) of all frames.
+        options: see `RetrievalOptions`.
+        robots: which robot each frame is of.
+        memory: of votes that were cast before.
+    """
+    near = candidates(glances, options.num_candidates, robots)
+
+    def work(voter: int) -> Cast:
+        return cast(short[voter], short[near[voter]], options.num_votes)
+
+    found = (memory or Forgetful(len(near))).cast(near, work)
+    return counted(near, found, options.num_candidates)
 
 
-def _summed(
-    ends: Indices, cast: NDArray[np.float64], num_frames: int
-) -> tuple[Indices, NDArray[np.float64]]:
-    """Add up both directions of each pair."""
-    low, high = ends.min(axis=1), ends.max(axis=1)
-    key, place = np.unique(low * num_frames + high, return_inverse=True)
-    weight: NDArray[np.float64] = np.bincount(place, cast, len(key)).astype(np.float64)
-    return np.column_stack(np.divmod(key, num_frames)), weight
+def stacked(frames: Iterable[Described]) -> tuple[Short, Short]:
+    """Return the rows (n, num_features, c) and the glances (n, k c) of frames."""
+    every = list(frames)
+    return np.stack([frame.rows for frame in every]), np.stack([frame.glance for frame in every])
 
 
 def _largest(frame: Features, most: int) -> Short:
@@ -187,81 +239,30 @@ def _glance(short: Short, words: Short) -> Short:
     return glance
 
 
-def _candidates(
-    short: Short, words: Short, most: int, robots: Indices | None = None
-) -> list[Indices]:
-    """Return up to `most` frames that look most like each frame, in order, without itself.
-
-    Where `robots` (n,) are given, only frames of other robots.
-    """
-    count = len(short)
-    own = np.arange(count) if robots is None else robots
-    left = count - np.bincount(own, minlength=1)[own] if count else own
-    if count and left.max() <= most:
-        return [np.flatnonzero(own != own[i]) for i in range(count)]
-    glances = np.stack([_glance(frame, words) for frame in short]) if count else short
-    found: list[Indices] = []
-    for start in range(0, count, CHUNK):
-        likeness = glances[start : start + CHUNK] @ glances.T
-        likeness[own[start : start + CHUNK, None] == own] = -np.inf
-        for row, others in zip(likeness, left[start : start + CHUNK].tolist(), strict=True):
-            kept = min(most, others)
-            best = np.argpartition(-row, kept - 1)[:kept] if kept else np.zeros(0, np.int64)
-            found.append(np.sort(best))
-    return found
-
-
-def _cast(short: Short, voter: int, near: Indices, num_votes: int) -> NDArray[np.float64]:
-    """Return the votes (k,) of one frame for its candidates `near` (k,).
-
-    A feature finds its nearest kin in each candidate and votes for the `num_votes` nearest, by how
-    much nearer they are than the next: what looks like everything tells nothing.
-    """
-    count, size = len(near), short.shape[1]
-    others = short[near].reshape(count * size, -1)
-    likeness = (short[voter] @ others.T).reshape(size, count, size).max(axis=2)
-    value = np.maximum(likeness, 0.0) ** 2
-    if count > num_votes:
-        next_best = np.partition(value, count - 1 - num_votes, axis=1)[:, count - 1 - num_votes]
-        value = np.maximum(value - next_best[:, None], 0.0)
-    cast: NDArray[np.float64] = value.sum(axis=0, dtype=np.float64)
-    return cast
-
-
 def retrieved(
-    frames: Iterable[Features],
+    frames: Frames,
     sample: Iterable[Features],
     options: RetrievalOptions,
     robots: Indices | None = None,
+    memory: Memory | None = None,
 ) -> list[tuple[int, int]]:
     """Return pairs (i, j), i < j, where one is among the most similar frames of the other.
 
     Args:
-        frames: all frames; read after the sample.
+        frames: all frames; each is read once, after the sample, where the memory has it not.
         sample: those to learn from.
         options: see `RetrievalOptions`.
         robots: (n,) which robot each frame is of; None for one robot.
+        memory: of what was worked out before; nothing changes but the time it takes.
     """
-    known = learned(sample, options)
-    if known is None:
+    memory = memory or Forgetful(len(frames))
+    known = memory.vocabulary(lambda: learned(sample, options))
+    if known is None or not len(frames):
         return []
-    short = described(frames, known, options)
-    found = _most_similar(votes(short, known, options), options.num_frames)
+    every = memory.described(lambda place: described(frames[place], known, options))
+    short, glances = stacked(every)
+    found = most_similar(votes(short, glances, options, None, memory), options.num_frames)
     if robots is not None and len(np.unique(robots)) > 1:
-        others = votes(short, known, options, robots)
-        found |= _most_similar(others, options.num_others, options.least_votes)
+        others = votes(short, glances, options, robots, memory)
+        found |= most_similar(others, options.num_others, options.least_votes)
     return sorted(found)
-
-
-def _most_similar(found: Votes, most: int, least: float = 0.0) -> set[tuple[int, int]]:
-    """Return the pairs where one is among the `most` frames with most votes of the other.
-
-    And with at least `least` times the votes that the other gives a stranger.
-    """
-    by, other = np.concatenate([found.pairs, found.pairs[:, ::-1]]).T
-    order = np.lexsort((other, -np.tile(found.weight, 2), by))
-    by, other = by[order], other[order]
-    rank = np.arange(len(by)) - np.searchsorted(by, by)
-    enough = np.tile(found.weight, 2)[order] >= least * found.stranger[by]
-    ends = np.column_stack([by, other])[(rank < most) & enough]
-    return {(min(i, j), max(i, j)) for i, j in ends.tolist()}

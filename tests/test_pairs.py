@@ -8,8 +8,12 @@ from hypothesis import strategies as st
 from road_features import along_a_road
 
 from groundfuse.backend.measurement import FrameId
-from groundfuse.frontend import pairs
-from groundfuse.frontend.pairs import PairOptions, neighbour_pairs, retrieved_pairs, skip_pairs
+from groundfuse.frontend.pairs import (
+    neighbour_pairs,
+    retrieved_pairs,
+    sample_of,
+    skip_pairs,
+)
 from groundfuse.frontend.retrieval import RetrievalOptions
 
 
@@ -92,7 +96,7 @@ def test_every_gap_that_can_be_bridged_is(count, gaps, skip):
 def test_retrieved_pairs_name_frames_whatever_their_order():
     found = along_a_road(8, 15, np.random.default_rng(0))
     names = [*robot("A", 4), *robot("B", 4)]
-    options = PairOptions(retrieval=RetrievalOptions(num_frames=2))
+    options = RetrievalOptions(num_frames=2)
     alike = retrieved_pairs(dict(zip(names, found, strict=True)), options)
     assert {(names[k], names[k + 1]) for k in range(7)} <= set(alike)
     assert (FrameId("A", 3), FrameId("B", 0)) in alike
@@ -105,12 +109,10 @@ def test_one_more_frame_changes_no_pair_far_away():
     """What is learned from is drawn by name: the sample of the others stays, as do their pairs."""
     found = along_a_road(81, 15, np.random.default_rng(1))
     names = [*robot("A", 40), *robot("B", 41)]
-    options = PairOptions(
-        retrieval=RetrievalOptions(num_frames=2, num_candidates=12, num_sample=20)
-    )
+    options = RetrievalOptions(num_frames=2, num_candidates=12, num_sample=20)
     whole = dict(zip(names, found, strict=True))
     last = names[-1]
-    assert last not in sorted(names, key=pairs._lot)[:20]
+    assert last not in sample_of(names, options)
     without = {name: frame for name, frame in whole.items() if name != last}
     before, after = retrieved_pairs(without, options), retrieved_pairs(whole, options)
     assert {pair for pair in after if last not in pair} <= set(before)

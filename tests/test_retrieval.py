@@ -8,18 +8,28 @@ from floor_pairs import camera, features_of, photo
 from road_features import along_a_road, features
 
 from groundfuse.backend.measurement import FrameId, Se2
-from groundfuse.frontend import retrieval
+from groundfuse.frontend import retrieval, retrieval_votes
 from groundfuse.frontend.features import FeatureOptions
-from groundfuse.frontend.retrieval import RetrievalOptions, described, learned, retrieved, votes
+from groundfuse.frontend.retrieval import (
+    RetrievalOptions,
+    described,
+    learned,
+    retrieved,
+    stacked,
+    votes,
+)
 from groundfuse.tools.overlap import true_overlap
 
 OPTIONS = RetrievalOptions()
 
 
+def votes_of(frames, known, options):
+    return votes(*stacked(described(frame, known, options) for frame in frames), options)
+
+
 def table(frames, options=OPTIONS, sample=None):
     """Votes as a square table."""
-    known = learned(frames if sample is None else sample, options)
-    found = votes(described(frames, known, options), known, options)
+    found = votes_of(frames, learned(frames if sample is None else sample, options), options)
     square = np.zeros((len(frames), len(frames)))
     square[tuple(found.pairs.T)] = found.weight
     return square + square.T
@@ -59,7 +69,7 @@ def test_only_candidates_are_voted_for():
         frames = along_a_road(count, 30, np.random.default_rng(11), seen=40)
         known = learned(frames, OPTIONS)
         few = RetrievalOptions(num_candidates=6)
-        found = votes(described(frames, known, few), known, few)
+        found = votes_of(frames, known, few)
         assert len(found.pairs) <= 6 * count
     assert len(found.stranger) == 40
 
@@ -67,7 +77,7 @@ def test_only_candidates_are_voted_for():
 def test_each_pair_is_counted_once_in_order_with_positive_votes():
     frames = along_a_road(30, 15, np.random.default_rng(1))
     few, known = RetrievalOptions(num_candidates=9), learned(frames, OPTIONS)
-    found = votes(described(frames, known, few), known, few)
+    found = votes_of(frames, known, few)
     assert (found.pairs[:, 0] < found.pairs[:, 1]).all()
     assert found.pairs.tolist() == sorted(found.pairs.tolist())
     assert len({tuple(pair) for pair in found.pairs.tolist()}) == len(found.pairs)
@@ -178,7 +188,7 @@ def test_work_in_chunks_changes_nothing(monkeypatch):
     frames = along_a_road(30, 30, np.random.default_rng(6))
     options = RetrievalOptions(num_candidates=7)
     whole = table(frames, options)
-    monkeypatch.setattr(retrieval, "CHUNK", 11)
+    monkeypatch.setattr(retrieval_votes, "CHUNK", 11)
     np.testing.assert_allclose(table(frames, options), whole, rtol=1e-5)
 
 
@@ -219,8 +229,7 @@ def test_no_frame_one_frame_blank_frames():
     assert retrieved([], [], OPTIONS) == []
     assert retrieved([empty, empty], [empty], OPTIONS) == []
     assert retrieved(one, one, OPTIONS) == []
-    known = learned(one, OPTIONS)
-    assert len(votes(described([], known, OPTIONS), known, OPTIONS).pairs) == 0
+    assert retrieved([], one, OPTIONS) == []
     tiny = features(np.ones((1, 128), np.float32) / np.sqrt(128.0))
     assert retrieved([tiny, tiny], [tiny], OPTIONS) == []  # one point has no principal component
 

@@ -67,6 +67,58 @@ def test_what_was_put_in_is_there_next_time(path):
     assert {p.name for p in path.parent.iterdir()} == {"store.sqlite", "store.sqlite.lock"}
 
 
+def test_many_values_come_in_the_order_of_their_keys(monkeypatch):
+    """Whatever lies together, and whichever are not there or asked for twice."""
+    monkeypatch.setattr(module, "TOGETHER", 7)
+    store = Store()
+    for k in range(0, 40, 2):
+        put(store, k, key_of(k))
+    asked = [39, 3, 8, 8, *range(30, -1, -1)]
+    expected = [k if k % 2 == 0 else None for k in asked]
+    assert list(store.load_all(key_of(k) for k in asked)) == expected
+    assert store.known(key_of(k) for k in asked) == {key_of(k) for k in asked if k % 2 == 0}
+    assert list(store.load_all([])) == []
+
+
+def test_of_many_values_only_those_that_are_not_there_are_made(monkeypatch, path):
+    monkeypatch.setattr(module, "TOGETHER", 3)
+    places = []
+
+    def works(missing):
+        places.extend(missing)
+        return ((k, f"made {k}") for k in missing)
+
+    names, keys = [f"A{k}" for k in range(11)], [key_of(k) for k in range(11)]
+    with Store(path) as store:
+        put(store, "old", keys[4])
+        put(store, "old", keys[9])
+        found = store.kept_each("number", names, keys, works)
+        assert places == [0, 1, 2, 3, 5, 6, 7, 8, 10]
+        assert found == ["old" if k in (4, 9) else (k, f"made {k}") for k in range(11)]
+    with Store(path) as store:
+        assert store.kept_each("number", names, keys, works) == found
+    assert len(places) == 9
+    told = rows(path, "SELECT label FROM entry WHERE kind = 'number' ORDER BY key")
+    assert len(told) == 11
+    assert ("A7",) in told
+
+
+def test_work_that_fails_leaves_what_was_kept_before_it(monkeypatch):
+    monkeypatch.setattr(module, "TOGETHER", 2)
+    store, keys = Store(), [key_of(k) for k in range(6)]
+
+    def works(missing):
+        for k in missing:
+            if k == 5:
+                raise DataError("no such picture")
+            yield k
+
+    with pytest.raises(DataError, match=r"^no such picture$"):
+        store.kept_each("number", "abcdef", keys, works)
+    assert list(store.load_all(keys)) == [0, 1, 2, 3, None, None]
+    assert not store._base.in_transaction
+
+
 def test_without_a_path_it_lives_in_memory():
     with Store() as store:
         put(store, 1)

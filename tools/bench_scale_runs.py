@@ -18,7 +18,13 @@ from groundfuse.backend.measurement import FrameId
 from groundfuse.frontend.ahead import Result
 from groundfuse.frontend.features import FeatureOptions, detect
 from groundfuse.frontend.mosaic import MosaicOptions
-from groundfuse.frontend.retrieval import RetrievalOptions, described, learned, votes
+from groundfuse.frontend.retrieval import (
+    RetrievalOptions,
+    described,
+    learned,
+    stacked,
+    votes,
+)
 from groundfuse.tools import bench_frontend, fuse_team
 from groundfuse.tools.bench_scale_fleets import NAMES, TwiceMown, fleet_path
 from groundfuse.tools.errors import DataError
@@ -115,10 +121,11 @@ def recalls(team: TwiceMown, kind: str) -> Recalls:
     known = learned(sample, options)
     if known is None:
         raise DataError("no frame has features")
-    short, robots = described(features, known, options), np.zeros(len(features), dtype=np.int64)
+    short, glances = stacked(described(frame, known, options) for frame in features)
+    robots = np.zeros(len(features), dtype=np.int64)
     robots[team.num_first :] = 1
-    votes(short, known, options)  # retrieval asks both ways: all frames, and the other robots'
-    found = votes(short, known, options, robots)
+    votes(short, glances, options)  # retrieval asks both ways: all frames, and other robots'
+    found = votes(short, glances, options, robots)
     seconds = time.perf_counter() - begin
     table = np.zeros((len(features), len(features)))
     table[tuple(found.pairs.T)] = found.weight

@@ -4,21 +4,23 @@ A second round tries views that share floor by what their poses say, where the g
 the store knows already is not done again.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass
 
+import numpy as np
+
 from groundfuse.backend.measurement import FrameId, Rejected, RelativePose
-from groundfuse.frontend.pairs import Pair, neighbour_pairs, retrieved_pairs, skip_pairs
-from groundfuse.tools.code_version import code_of
+from groundfuse.frontend.pairs import Pair, neighbour_pairs, skip_pairs
 from groundfuse.tools.frame_look import LookJob, look_job
 from groundfuse.tools.front_end_options import FrontEndOptions, comparable
 from groundfuse.tools.packing import key_of, unpacked
 from groundfuse.tools.pair_verdict import PairJob, Spot, Verdict, named, pair_job
 from groundfuse.tools.robot import Robot
 from groundfuse.tools.shelf import AllFeatures, Shelf
+from groundfuse.tools.similar import similar_pairs
 from groundfuse.tools.store import Store
-from groundfuse.tools.workers import Progress, Workers, in_threads
+from groundfuse.tools.workers import Progress, Threads, Workers, in_threads
 
 Stage = Callable[[str], AbstractContextManager[None]]
 READERS = 4
@@ -95,7 +97,7 @@ class FrontEnd:
             jobs = list(in_threads(lambda rf: look_job(*rf, options), placed, READERS))
             shelf = Shelf(store, {job.key: job for job in jobs}, options)
             self._num_looks = _look(jobs, shelf, workers, options, store, progress)
-            self._repetition = {job.frame.id: _repetition(job, shelf, store) for job in jobs}
+            self._repetition = _repetition(jobs, shelf, store)
         self._pictures = {job.frame.id: job.picture for job in jobs}
         spots = {
             job.frame.id: Spot(job.frame, robot, job.key)
@@ -106,7 +108,10 @@ class FrontEnd:
         self._tried = _Pairs(spots, shelf, workers, options, store, progress)
         self._num_further = 0
         with stage("retrieval"):
-            similar = _similar(self._order, spots, shelf, options, store)
+            looks = {frame: spots[frame].key for frame in self._order}
+            threads = workers.num_threads if isinstance(workers, Threads) else 1
+            seen, how = AllFeatures(shelf, looks), options.pairs.retrieval
+            similar = similar_pairs(looks, seen, how, store, threads)
         with stage("pairs"):
             self._tried.add([*neighbour_pairs(self._order), *similar], "pairs")
             for skip in range(2, options.pairs.max_skip + 1):
@@ -131,8 +136,11 @@ class FrontEnd:
 
     def result(self) -> FrontEndResult:
         """Return what was found so far."""
-        tried = self._tried
-        outcome = [tried.found[pair] for pair in sorted(tried.found)]
+        tried, place = self._tried, {frame: k for k, frame in enumerate(self._order)}
+        pairs = sorted((place[a], place[b]) for a, b in tried.found)
+        named = [(self._order[i], self._order[j]) for i, j in pairs]
+        outcome = [tried.found[pair] for pair in named]
+        keys = b"".join(tried.keys[pair] for pair in named)
         return FrontEndResult(
             tuple(found for found in outcome if isinstance(found, RelativePose)),
             tuple(found for found in outcome if isinstance(found, Rejected)),
@@ -140,7 +148,7 @@ class FrontEnd:
             self._pictures,
             Reused(self._num_looks, len(self._order), tried.num_known, len(tried.found)),
             self._num_further,
-            key_of("front end", sorted(tried.keys.items()), self._order),
+            key_of("front end", self._order, np.array(pairs, dtype=np.int64), keys),
         )
 
 
@@ -178,37 +186,15 @@ def _look(
     return sum(job.key in known for job in jobs)
 
 
-def _repetition(job: LookJob, shelf: Shelf, store: Store) -> float:
-    """Return one number of a frame's features without fetching all of them each time."""
-    found: float = store.kept(
-        "repetition",
-        str(job.frame.id),
-        (job.key,),
-        lambda: shelf.looked(job.key).features.repetition,
-    )
-    return found
+def _repetition(jobs: Sequence[LookJob], shelf: Shelf, store: Store) -> dict[FrameId, float]:
+    """Return one number of each frame's features without fetching all of them each time."""
 
+    def works(places: Sequence[int]) -> Iterator[float]:
+        return (shelf.looked(jobs[k].key).features.repetition for k in places)
 
-def _similar(
-    order: Sequence[FrameId],
-    spots: dict[FrameId, Spot],
-    shelf: Shelf,
-    options: FrontEndOptions,
-    store: Store,
-) -> list[Pair]:
-    """Return the pairs that look alike; they depend on nothing but what was seen, and the order."""
-    place = {frame: k for k, frame in enumerate(order)}
-    keys = {frame: spots[frame].key for frame in order}
-
-    def work() -> list[tuple[int, int]]:
-        pairs = retrieved_pairs(AllFeatures(shelf, keys), options.pairs)
-        return [(place[a], place[b]) for a, b in pairs]
-
-    robots = [frame.robot for frame in order]
-    code, looks = code_of("groundfuse.frontend.pairs"), list(keys.values())
-    parts = (code, looks, robots, options.pairs.retrieval)
-    found: tuple[tuple[int, int], ...] = store.kept("retrieval", "team", parts, work)
-    return [(order[i], order[j]) for i, j in found]
+    names, keys = [str(job.frame.id) for job in jobs], [key_of("repetition", j.key) for j in jobs]
+    found = store.kept_each("repetition", names, keys, works)
+    return {job.frame.id: value for job, value in zip(jobs, found, strict=True)}
 
 
 class _Pairs:
@@ -239,17 +225,18 @@ class _Pairs:
 
     def add(self, pairs: Iterable[Pair], title: str) -> None:
         """Try pairs, each once."""
+        new = [(a, b) for a, b in dict.fromkeys(pairs) if (a, b) not in self.found]
+        jobs = [pair_job(self._spots[a], self._spots[b], self._options) for a, b in new]
         todo: list[PairJob] = []
-        for a, b in dict.fromkeys(pairs):
-            if (a, b) not in self.found:
-                job = pair_job(self._spots[a], self._spots[b], self._options)
-                self.keys[a, b] = job.key
-                known: Verdict | None = self._store.load(job.key)
-                if known is None:
-                    todo.append(job)
-                else:
-                    self.num_known += 1
-                    self.found[a, b] = named(known, a, b)
+        known: Verdict | None
+        verdicts = self._store.load_all(job.key for job in jobs)
+        for (a, b), job, known in zip(new, jobs, verdicts, strict=True):
+            self.keys[a, b] = job.key
+            if known is None:
+                todo.append(job)
+            else:
+                self.num_known += 1
+                self.found[a, b] = named(known, a, b)
         if not todo:
             return
         with closing(self._workers.compare(todo, self._shelf, self._options)) as found:

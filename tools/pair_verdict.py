@@ -73,7 +73,7 @@ def pair_job(a: Spot, b: Spot, options: FrontEndOptions) -> PairJob:
     gate = odometry_gate(a, b, options)
     widened = None if gate is None else swayed(gate, a, b, options)
     views, looks = (_view(a), _view(b)), (a.key, b.key)
-    known = [(view.prior, view.base_from_foot) for view in views]
+    known = [_key_of_view(v.prior.mean, v.prior.sigma, v.base_from_foot) for v in views]
     match = options.paper if options.matcher is Matcher.PAPER else options.match
     how = _key_of_method(match, options.motion)
     return PairJob(*views, gate, widened, looks, key_of("pair", how, looks, known, gate, widened))
@@ -85,6 +85,12 @@ def _key_of_method(
 ) -> bytes:
     """Return what stands for code and options: the same for all pairs of a run."""
     return key_of("how", code_of("groundfuse.tools.pair_verdict"), match, motion)
+
+
+@functools.lru_cache(maxsize=4096)
+def _key_of_view(mean: Attitude, sigma: Attitude, base_from_foot: Se2) -> bytes:
+    """Return what stands for a camera's place: the same for many pairs, often for many frames."""
+    return key_of("view", mean, sigma, base_from_foot)
 
 
 def verdict(job: PairJob, a: Looked, b: Looked, options: FrontEndOptions) -> Verdict:

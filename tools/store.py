@@ -14,20 +14,26 @@ import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 from groundfuse.tools.errors import DataError
-from groundfuse.tools.packing import is_whole, key_of, packed, unpacked
+from groundfuse.tools.packing import DamagedError, is_whole, key_of, packed, unpacked
 from groundfuse.tools.store_lock import Lock
 
+Result = TypeVar("Result")
+Row = tuple[bytes, str, str]
+"""An entry's packed value, what it is, and whose."""
 log = logging.getLogger(__name__)
 STORE = "store.sqlite"
 """Its usual name, in the out folder."""
 APPLICATION = 0x67667573  # "gfus"
 VERSION = 1
 SYNC_S = 5.0
+TOGETHER = 256
+"""Entries that are fetched with one question."""
 MAGIC = b"SQLite format 3\0"
 TABLES = """
 CREATE TABLE run(
@@ -95,28 +101,52 @@ class Store:
 
     def known(self, keys: Iterable[bytes]) -> set[bytes]:
         """Return the keys that have an entry."""
-        find = "SELECT 1 FROM entry WHERE key = ?"
-        with self._told(), self._guard:
-            return {key for key in keys if self._base.execute(find, (key,)).fetchone()}
+        found, left = set[bytes](), iter(keys)
+        while part := list(islice(left, TOGETHER)):
+            find = f"SELECT key FROM entry WHERE key IN ({_marks(part)})"  # noqa: S608
+            with self._told(), self._guard:
+                found.update(key for (key,) in self._base.execute(find, part))
+        return found
 
     def load(self, key: bytes) -> Any:  # noqa: ANN401
         """Return an entry's value; None where there is none, or a damaged one (which is told)."""
-        data = self.read(key)
-        return None if data is None else unpacked(data)
+        return next(self.load_all([key]))
+
+    def load_all(self, keys: Iterable[bytes]) -> Iterator[Any]:
+        """Yield entries' values in the order of their keys, as `load` does; few lie packed."""
+        left = iter(keys)
+        while part := list(islice(left, TOGETHER)):
+            rows = self._rows(part)
+            yield from (self._value(rows.get(key)) for key in part)
 
     def read(self, key: bytes) -> bytes | None:
         """Return an entry as it is packed; None as in `load`."""
-        find = "SELECT value, kind, label FROM entry WHERE key = ?"
-        with self._told(), self._guard:
-            row = self._base.execute(find, (key,)).fetchone()
+        row = self._rows([key]).get(key)
         if row is None:
             return None
-        value, kind, label = row
-        if not is_whole(value):
-            log.warning("%s: %s of %s is damaged, computed anew", self.path, kind, label)
+        if not is_whole(row[0]):
+            self._tell_damaged(row)
             return None
-        data: bytes = value
-        return data
+        return row[0]
+
+    def _rows(self, keys: Sequence[bytes]) -> dict[bytes, Row]:
+        columns = "key, value, kind, label"
+        find = f"SELECT {columns} FROM entry WHERE key IN ({_marks(keys)})"  # noqa: S608
+        with self._told(), self._guard:
+            return {row[0]: row[1:] for row in self._base.execute(find, keys)}
+
+    def _value(self, row: Row | None) -> Any:  # noqa: ANN401
+        if row is None:
+            return None
+        try:
+            return unpacked(row[0])
+        except (DamagedError, TypeError):
+            self._tell_damaged(row)
+            return None
+
+    def _tell_damaged(self, row: Row) -> None:
+        _, kind, label = row
+        log.warning("%s: %s of %s is damaged, computed anew", self.path, kind, label)
 
     def save(self, key: bytes, kind: str, label: str, value: bytes) -> None:
         """Keep a packed value from now on, whatever happens to the process.
@@ -130,10 +160,19 @@ class Store:
         Raises:
             DataError: the disk is full, or fails; what is there already stays.
         """
+        self._save_all(kind, [(key, label, value)])
+
+    def _save_all(self, kind: str, entries: Sequence[tuple[bytes, str, bytes]]) -> None:
+        """Keep packed values of a kind, all or, where the process ends, none."""
         insert = "INSERT OR REPLACE INTO entry(key, kind, label, run, value) VALUES (?, ?, ?, ?, ?)"
-        readable = label.encode(errors="replace").decode()
+        rows = [
+            (key, kind, label.encode(errors="replace").decode(), self._run, value)
+            for key, label, value in entries
+        ]
         with self._told(), self._guard:
-            self._base.execute(insert, (key, kind, readable, self._run, value))
+            with self._base:
+                self._base.execute("BEGIN")
+                self._base.executemany(insert, rows)
             if time.monotonic() - self._synced_s > SYNC_S:
                 self._base.execute("PRAGMA wal_checkpoint(PASSIVE)")
                 self._synced_s = time.monotonic()
@@ -164,6 +203,30 @@ class Store:
             data = packed(work())
             self.save(key, kind, label, data)
             found = unpacked(data)
+        return found
+
+    def kept_each(
+        self,
+        kind: str,
+        labels: Sequence[str],
+        keys: Sequence[bytes],
+        works: Callable[[Sequence[int]], Iterable[Result]],
+    ) -> list[Result]:
+        """Return many values of a kind, from the entries of their keys where there are such.
+
+        Args:
+            kind: what they are.
+            labels: whose each is, for people.
+            keys: of each, digests of all that it depends on.
+            works: yields those of the places it is given, in order.
+        """
+        found: list[Any] = list(self.load_all(keys))
+        missing = [place for place, value in enumerate(found) if value is None]
+        made = zip(missing, works(missing), strict=True)
+        while part := [(place, packed(value)) for place, value in islice(made, TOGETHER)]:
+            self._save_all(kind, [(keys[place], labels[place], data) for place, data in part])
+            for place, data in part:
+                found[place] = unpacked(data)
         return found
 
     @contextmanager
@@ -202,6 +265,10 @@ def _opened(path: Path | None) -> sqlite3.Connection:
         base.close()
         raise
     return base
+
+
+def _marks(values: Sequence[object]) -> str:
+    return ",".join("?" * len(values))
 
 
 def _check_version(path: Path | None, found: int) -> None:

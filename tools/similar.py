@@ -1,0 +1,103 @@
+"""Which pairs look alike, worked out for what is new only: piece by piece from the store.
+
+What is kept of a frame depends on its look and on what the sample taught; the votes that it casts
+on its candidates' looks besides. So one picture more costs its own description and the votes of
+those frames whose candidates it becomes, and no other frame's features are fetched again.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+from groundfuse.backend.measurement import FrameId
+from groundfuse.frontend.ahead import Result
+from groundfuse.frontend.features import Features
+from groundfuse.frontend.pairs import Pair, retrieved_pairs, sample_of
+from groundfuse.frontend.retrieval import Described, RetrievalOptions, Vocabulary
+from groundfuse.frontend.retrieval_votes import Cast, Indices
+from groundfuse.tools.code_version import code_of
+from groundfuse.tools.packing import key_of
+from groundfuse.tools.store import Store
+from groundfuse.tools.workers import in_threads
+
+
+def similar_pairs(
+    looks: Mapping[FrameId, bytes],
+    features: Mapping[FrameId, Features],
+    options: RetrievalOptions,
+    store: Store,
+    num_threads: int,
+) -> list[Pair]:
+    """Return the pairs that look alike; they depend on nothing but what was seen, and the order.
+
+    Args:
+        looks: keys of what was seen of every frame.
+        features: of every frame, fetched where they are needed.
+        options: of retrieval.
+        store: what is known.
+        num_threads: that vote.
+
+    Raises:
+        DataError: a picture can't be read again, or the store can't be written.
+    """
+    order = sorted(looks)
+    place = {frame: k for k, frame in enumerate(order)}
+
+    def work() -> list[tuple[int, int]]:
+        memory = Pieces(store, {frame: looks[frame] for frame in order}, options, num_threads)
+        pairs = retrieved_pairs(features, options, memory)
+        return [(place[a], place[b]) for a, b in pairs]
+
+    code, robots = code_of("groundfuse.frontend.pairs"), [frame.robot for frame in order]
+    parts = (code, [looks[frame] for frame in order], robots, options)
+    found: tuple[tuple[int, int], ...] = store.kept("retrieval", "team", parts, work)
+    return [(order[i], order[j]) for i, j in found]
+
+
+class Pieces:
+    """What retrieval works out, from the store where it was before; see `retrieval.Memory`.
+
+    Args:
+        store: where the pieces are.
+        looks: keys of what was seen, of the frames in order.
+        options: of retrieval.
+        num_threads: that describe and vote.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        looks: Mapping[FrameId, bytes],
+        options: RetrievalOptions,
+        num_threads: int,
+    ) -> None:
+        self._store = store
+        self._names = [str(frame) for frame in looks]
+        self._looks = list(looks.values())
+        self._num_threads = num_threads
+        sample = [looks[frame] for frame in sample_of(looks, options)]
+        self._taught = key_of("taught", code_of("groundfuse.frontend.retrieval"), options, sample)
+
+    def vocabulary(self, work: Callable[[], Vocabulary | None]) -> Vocabulary | None:
+        """Return what the sample taught: it depends on the sample's looks in order."""
+        found: Vocabulary | None = self._store.kept("vocabulary", "team", (self._taught,), work)
+        return found
+
+    def described(self, work: Callable[[int], Described]) -> list[Described]:
+        """Return what is kept of every frame: it depends on its look and what was taught."""
+        keys = [key_of("described", self._taught, look) for look in self._looks]
+        return self._each("described", keys, work)
+
+    def cast(self, near: Sequence[Indices], work: Callable[[int], Cast]) -> list[Cast]:
+        """Return every frame's votes: they depend on the looks of its candidates, too."""
+        keys = []
+        for look, frames in zip(self._looks, near, strict=True):
+            others = b"".join(self._looks[k] for k in frames.tolist())
+            keys.append(key_of("votes", self._taught, look, others))
+        return self._each("votes", keys, work)
+
+    def _each(
+        self, kind: str, keys: Sequence[bytes], work: Callable[[int], Result]
+    ) -> list[Result]:
+        def works(places: Sequence[int]) -> Iterable[Result]:
+            return in_threads(work, places, self._num_threads)
+
+        return self._store.kept_each(kind, self._names, keys, works)
