@@ -16,7 +16,7 @@ from groundfuse.frontend.mosaic_options import MosaicOptions
 from groundfuse.frontend.mosaic_plan import MosaicPlan, MosaicView, plan_mosaic
 from groundfuse.frontend.mosaic_stream import mosaic_tiles
 from groundfuse.frontend.mosaic_tile import Tile
-from groundfuse.frontend.selection import FEWEST_VIEWS
+from groundfuse.frontend.selection_compiled import FEWEST_VIEWS
 from groundfuse.frontend.sight import Grid
 
 __all__ = ["Mosaic", "MosaicOptions", "MosaicView", "build_mosaic"]

@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from groundfuse.frontend.arrays import Floats, Image, Picture32
-from groundfuse.frontend.selection import LEVEL
-from groundfuse.frontend.selection_compiled import combine_cells
+from groundfuse.frontend.selection_compiled import LEVEL, combine_cells
 from groundfuse.frontend.sight import SeenCells
 from groundfuse.frontend.tile_compiled import add_held, by_depth, put, to_levels
 
@@ -34,7 +33,7 @@ class TileStack:
         self._footprint = np.empty((num_cells, depth), dtype=np.float32)
         self._weight = np.empty((depth, num_cells), dtype=np.float32)
         self._held = np.zeros(num_cells, dtype=np.uint8)
-        self._coarsest = np.zeros(num_cells, dtype=np.uint8)
+        self._coarsest = np.full(num_cells, depth, dtype=np.uint8)
         self._left_out = np.zeros((3, num_cells), dtype=np.float32)
         self._count = np.zeros(num_cells, dtype=np.uint16)
 

@@ -1,14 +1,32 @@
-"""`selection.combined`, compiled: the same rule, a few cells at once in the processor's cache."""
+"""The colour of a floor cell from several views of it, some of which show something else.
+
+The paper's rule (§5.1): discard the view that deviates most from the mean of those that are left,
+until half are gone; of equal deviations the view with the larger footprint goes, of equal
+footprints the later one. Here the rule selects; then every view that agrees with the surviving
+half counts, because on free floor half the views would be thrown away for nothing: a view agrees
+within so many sigmas of the half's mean, where a sigma is what the half spreads, allowing for its
+having been selected, or the noise where that is larger, and the half's mean has its own share.
+
+Compiled, a few cells at once in the processor's cache.
+"""
 
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from groundfuse.frontend.arrays import Picture32
 from groundfuse.frontend.compiled import compiled
-from groundfuse.frontend.selection import BITS, FEWEST_VIEWS, SURVIVING_SPREAD
 
+LEVEL = 2.0
+"""Colours are whole numbers of half levels: sums are exact, so that equal deviations are equal
+on every machine and the tie rule decides, not rounding."""
+BITS = 10
+"""Of a colour's half levels: blue, green and red fit into one word, blue lowest."""
+FEWEST_VIEWS = 3
+"""With fewer views no majority shows the floor."""
+SURVIVING_SPREAD = 4.0
+"""Variance of views over that of their surviving half. Grey noise gives 8 to 12 from five views on
+(the half is selected for its small spread), noise that differs between channels about 2.5. Too
+small a value averages fewer views; too large a one lets obstacles in."""
 LANES = 128
 """Cells worked on at once: the compiler turns loops over them into vector instructions."""
 
@@ -22,7 +40,7 @@ LARGEST = 2**BITS - 1
 
 @compiled
 def _discard_half(c: Any, size: Any, alive: Any, total: Any) -> None:  # noqa: ANN401
-    """The paper's rule; see `selection.discard_half`. All are whole numbers below 2**31.
+    """The paper's rule. All are whole numbers below 2**31.
 
     With n views of sum S left, |n c - S|^2 = n (n |c|^2 - 2 c S) + |S|^2: the bracket has the same
     order. A view that is gone gets a square so low that its bracket is below every other.
@@ -40,9 +58,10 @@ def _discard_half(c: Any, size: Any, alive: Any, total: Any) -> None:  # noqa: A
         most[:] = NOTHING
         for k in range(num_views):
             for i in range(LANES):
-                product = c[k, 0, i] * total[0, i] + c[k, 1, i] * total[1, i]
-                product += c[k, 2, i] * total[2, i]
-                away = left * square[k, i] - product - product
+                product = np.int32(c[k, 0, i] * total[0, i])  # without the word it has 64 bits
+                product += np.int32(c[k, 1, i] * total[1, i])
+                product += np.int32(c[k, 2, i] * total[2, i])
+                away = np.int32(np.int32(left * square[k, i]) - np.int32(2 * product))
                 farther = (away > most[i]) | ((away == most[i]) & (size[k, i] >= coarsest[i]))
                 most[i] = away if farther else most[i]
                 coarsest[i] = size[k, i] if farther else coarsest[i]
@@ -57,7 +76,7 @@ def _discard_half(c: Any, size: Any, alive: Any, total: Any) -> None:  # noqa: A
 
 @compiled
 def _admit(c: Any, alive: Any, total: Any, noise2: Any, sigmas2: Any) -> None:  # noqa: ANN401
-    """Mark the views that agree with the surviving half; see `selection.agreeing_views`."""
+    """Mark the views that agree with the surviving half."""
     num_views = len(c)
     survivors = num_views - num_views // 2
     share = np.float32(1.0 / survivors)
@@ -102,10 +121,12 @@ def combine_cells(
     limits: tuple[Any, Any],
     floor: Any,  # noqa: ANN401
 ) -> None:
-    """Fill the floor's colours; see `selection.combined`.
+    """Fill the floor's colours: the weighted means of the views that agree.
+
+    Fewer than three views can't outvote anything: their plain weighted mean.
 
     Args:
-        words: (n, all cells) colours; see `selection.BITS`.
+        words: (n, all cells) colours; see `BITS`.
         footprint: (all cells, n) for the tie rule.
         weight: (n, all cells) positive.
         cells: (m,) those to fill.
@@ -136,20 +157,3 @@ def combine_cells(
             _discard_half(c, size, alive, total)
             _admit(c, alive, total, limits[0], limits[1])
         _average(c, alive, share, floor, some)
-
-
-def combined(
-    colours: NDArray[Any],
-    footprint: Picture32,
-    weight: Picture32,
-    noise: float,
-    num_sigmas: float,
-) -> Picture32:
-    """Return what `selection.combined` does, up to rounding; colours of any whole-number type."""
-    blue, green, red = (colours[:, channel].astype(np.uint32) for channel in range(3))
-    words = blue | green << np.uint32(BITS) | red << np.uint32(2 * BITS)
-    floor: Picture32 = np.empty(colours.shape[1:], dtype=np.float32)
-    cells, sizes = np.arange(floor.shape[1]), np.ascontiguousarray(footprint.T)
-    limits = np.float32(noise**2), np.float32(num_sigmas**2)
-    combine_cells(words, sizes, weight, cells, limits, floor)
-    return floor

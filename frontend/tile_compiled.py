@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from groundfuse.frontend.compiled import compiled
-from groundfuse.frontend.selection import BITS, LEVEL
+from groundfuse.frontend.selection_compiled import BITS, LEVEL
 
 HIGHEST = 511.0
 """Levels; brighter ones (after division by a small gain) are cut, so that squares stay exact."""
@@ -17,7 +17,18 @@ FINE_CELLS = 0.5
 
 
 @compiled
-def border_weight(u: Any, v: Any, limits: Any) -> Any:  # noqa: ANN401
+def slope_of(limits: Any) -> Any:  # noqa: ANN401
+    """Return the weight that a view gains per pixel from its border inwards; see `border_weight`.
+
+    Args:
+        limits: last column, first and last row of the used picture.
+    """
+    shorter = min(limits[0], limits[2] - limits[1]) + np.float32(1.0)
+    return np.float32(1.0) / max(np.float32(BORDER_SHARE) * shorter, np.float32(1.0))
+
+
+@compiled
+def border_weight(u: Any, v: Any, limits: Any, slope: Any) -> Any:  # noqa: ANN401
     """Return the weight of a pixel: it fades towards the picture's border.
 
     No seam shows where a view ends.
@@ -25,12 +36,11 @@ def border_weight(u: Any, v: Any, limits: Any) -> Any:  # noqa: ANN401
     Args:
         u: column.
         v: row.
-        limits: last column, first and last row of the used picture.
+        limits: see `slope_of`.
+        slope: likewise.
     """
     inside = min(u, limits[0] - u, v - limits[1], limits[2] - v)
-    shorter = min(limits[0], limits[2] - limits[1]) + np.float32(1.0)
-    ramp = max(np.float32(BORDER_SHARE) * shorter, np.float32(1.0))
-    return min(max(inside / ramp, np.float32(SMALLEST_WEIGHT)), np.float32(1.0))
+    return min(max(inside * slope, np.float32(SMALLEST_WEIGHT)), np.float32(1.0))
 
 
 @compiled
@@ -46,11 +56,11 @@ def sharpness_weight(footprint_cells: Any) -> Any:  # noqa: ANN401
 
 
 @compiled
-def _word(colour: Any, factor: Any, gain: Any) -> Any:  # noqa: ANN401
+def _word(colours: Any, k: int, factor: Any, gain: Any) -> Any:  # noqa: ANN401
     """Return a compensated colour as half levels, three in a word."""
     word = np.uint32(0)
     for channel in range(3):
-        level = min(colour[channel] * factor * gain[channel], np.float32(HIGHEST))
+        level = min(colours[k, channel] * factor * gain[channel], np.float32(HIGHEST))
         half = np.uint32(np.rint(level * np.float32(LEVEL)))
         word |= half << np.uint32(BITS * channel)
     return word
@@ -91,30 +101,33 @@ def put(
         limits: see `border_weight`.
         stack: of the views held: colours (depth, cells) as words, footprints (cells, depth), which
             are searched cell by cell, and weights (depth, cells).
-        tallies: views held, views seen, the coarsest of a full stack (cells,), and the sums
-            (3, cells) of the colours left out.
+        tallies: views held, views seen, the coarsest of a full stack (cells,), `depth` until
+            it is needed, and the sums (3, cells) of the colours left out.
     """
     cells, places, colours = seen
     words, footprint, weight = stack
     held, count, coarsest, left_out = tallies
-    depth = len(words)
+    depth, slope = len(words), slope_of(limits)
+    edges, factors = (limits[0], limits[1], limits[2]), (gain[0], gain[1], gain[2])
     for k in range(len(cells)):
         cell = (cells[k, 0] + origin[0]) * origin[2] + cells[k, 1] + origin[1]
-        word, size = _word(colours[k], places[k, 3], gain), places[k, 2]
+        word, size = _word(colours, k, places[k, 3], factors), places[k, 2]
         count[cell] += 1
         slot = np.int64(held[cell])
         if slot < depth:
             held[cell] += 1
         else:
+            if coarsest[cell] == depth:
+                coarsest[cell] = _coarsest(footprint, cell)
             slot = np.int64(coarsest[cell])
             if not size < footprint[cell, slot]:
                 _leave_out(word, cell, left_out)
                 continue
             _leave_out(words[slot, cell], cell, left_out)
         words[slot, cell], footprint[cell, slot] = word, size
-        faded = border_weight(places[k, 0], places[k, 1], limits)
+        faded = border_weight(places[k, 0], places[k, 1], edges, slope)
         weight[slot, cell] = faded * sharpness_weight(size)
-        if held[cell] == depth:
+        if coarsest[cell] < depth:
             coarsest[cell] = _coarsest(footprint, cell)
 
 

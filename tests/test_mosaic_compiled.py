@@ -1,11 +1,11 @@
 """The compiled rule is numpy's, view for view, ties and all; the stack keeps the finest views."""
 
 import numpy as np
+import plain_selection
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from groundfuse.frontend import selection
 from groundfuse.frontend import selection_compiled as compiled
 from groundfuse.frontend.mosaic_tile import TileStack
 from groundfuse.frontend.sight import SeenCells
@@ -16,6 +16,16 @@ TOLERANCE_HALF_LEVELS = 2e-3
 # Two roundings of a level lie between the plain reading and the stack's: half levels, then levels.
 TOLERANCE_LEVELS = 1
 LIMITS = np.array([159.0, 0.0, 119.0], np.float32)
+
+
+def compiled_combined(colours, footprint, weight, noise, num_sigmas):
+    """What `plain_selection.combined` returns, by the compiled rule."""
+    words = sum(colours[:, k].astype(np.uint32) << np.uint32(compiled.BITS * k) for k in range(3))
+    floor = np.empty(colours.shape[1:], np.float32)
+    every, limits = np.arange(floor.shape[1]), (np.float32(noise**2), np.float32(num_sigmas**2))
+    sizes = np.ascontiguousarray(footprint.T)
+    compiled.combine_cells(words, sizes, weight, every, limits, floor)
+    return floor
 
 
 def cells(num_views, num_cells, highest, seed):
@@ -38,7 +48,7 @@ def test_views_that_count_are_those_of_numpy(num_views, num_cells, highest, seed
     weight = np.repeat(2.0 ** np.arange(num_views)[:, None], num_cells, axis=1).astype(np.float32)
     for some in (np.ones_like(weight), weight):
         arguments = colours, footprint, some, 3.0, 3.0
-        expected, found = selection.combined(*arguments), compiled.combined(*arguments)
+        expected, found = plain_selection.combined(*arguments), compiled_combined(*arguments)
         assert np.abs(found - expected).max() < TOLERANCE_HALF_LEVELS
 
 
@@ -48,7 +58,7 @@ def test_the_highest_sums_do_not_overflow(num_views):
     colours[: num_views // 3] = 1022
     colours[num_views // 3 : num_views // 2] = 0
     arguments = colours, footprint, weight, 3.0, 0.1
-    expected, found = selection.combined(*arguments), compiled.combined(*arguments)
+    expected, found = plain_selection.combined(*arguments), compiled_combined(*arguments)
     assert np.abs(found - expected).max() < TOLERANCE_HALF_LEVELS
 
 
@@ -57,7 +67,7 @@ def test_obstacles_are_outvoted():
     things = np.array([(900, 20, 400), (30, 700, 10), (1000, 1000, 1000)])
     colours[[0, 3, 5]] = things[:, :, None]
     ones = np.ones((7, 300), np.float32)
-    assert (compiled.combined(colours, ones, ones, 3.0, 3.0) == 200.0).all()
+    assert (compiled_combined(colours, ones, ones, 3.0, 3.0) == 200.0).all()
 
 
 def random_views(rng, shape):
@@ -97,7 +107,7 @@ def plain_layers(views, shape, depth):
                 kept[coarsest] = view
         colours, sizes, weights = (np.array(part, np.float32) for part in zip(*kept, strict=True))
         column = colours[:, :, None], sizes[:, None], weights[:, None]
-        floor[cell] = selection.combined(*column, 6.0, 3.0)[:, 0] / 2.0
+        floor[cell] = plain_selection.combined(*column, 6.0, 3.0)[:, 0] / 2.0
     return floor, mean, {cell: len(found) for cell, found in held.items()}
 
 

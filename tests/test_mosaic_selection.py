@@ -5,8 +5,7 @@ from fractions import Fraction
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-
-from groundfuse.frontend.selection import agreeing_views, combined, discard_half
+from plain_selection import agreeing_views, combined, discard_half
 
 levels = st.integers(0, 510)
 colour = st.tuples(levels, levels, levels)

@@ -4,9 +4,11 @@
     bench_mosaic.py --views 40       denser overlap in the second
 
 Combining: 16 and 7 noisy views a cell, a fifth of the cells with an obstacle in a third of the
-views; beside it numpy's median, which keeps half the noise of the views it throws away and knows
-no weights. Everything: pictures of 640 x 480 of a noise floor held in memory, tilted by 33 deg, all
-around one spot, one thread; seconds are the processor's. Millions of seen cells per second.
+views: taking a tile's stack of views down to its layers, and that with putting the views on it,
+which compensates their exposure, weighs and packs them. Beside it numpy's median, which keeps half
+the noise of the views it throws away and knows no weights. Everything: pictures of 640 x 480 of a
+noise floor held in memory, tilted by 33 deg, all around one spot, one thread; seconds are the
+processor's. Millions of seen cells per second.
 """
 
 import argparse
@@ -14,21 +16,22 @@ import math
 import sys
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from functools import partial
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from groundfuse.backend.measurement import Attitude, FrameId, Se2
-from groundfuse.frontend import selection, selection_compiled
 from groundfuse.frontend.arrays import Image
 from groundfuse.frontend.camera import Camera, Intrinsics, Mount
 from groundfuse.frontend.mosaic import MosaicOptions, MosaicView, build_mosaic
+from groundfuse.frontend.mosaic_tile import TileStack
+from groundfuse.frontend.sight import SeenCells
 
-NUM_CELLS = 65_536
+SIDE = 256
+LIMITS = np.array([639.0, 0.0, 479.0], np.float32)
 REPEATS = 5
-NOISE_HALF_LEVELS = 6.0
+NOISE_LEVELS = 3.0
 HEIGHT_M = 0.55
 CELL_M = 0.0015
 
@@ -44,30 +47,47 @@ def fastest_s(work: Callable[[], object]) -> float:
     return min(seconds)
 
 
-def noisy_views(depth: int) -> tuple[NDArray[np.uint16], NDArray[np.float32]]:
-    """Colours (depth, 3, cells) in half levels and footprints (depth, cells)."""
+def noisy_views(depth: int) -> list[SeenCells]:
+    """Views of all cells of a tile."""
     rng = np.random.default_rng(depth)
-    colours = np.rint(rng.normal(240.0, NOISE_HALF_LEVELS, (depth, 3, NUM_CELLS)))
-    colours[: depth // 3, :, : NUM_CELLS // 5] += 120.0
-    return colours.astype(np.uint16), rng.uniform(1, 3, (depth, NUM_CELLS)).astype(np.float32)
+    rows, columns = np.divmod(np.arange(SIDE * SIDE), SIDE)
+    cell = np.column_stack([rows, columns]).astype(np.int32)
+    views = []
+    for number in range(depth):
+        colour = rng.normal(120.0, NOISE_LEVELS, (SIDE * SIDE, 3)).astype(np.float32)
+        if number < depth // 3:
+            colour[: SIDE * SIDE // 5] += 60.0
+        lowest, highest = (0.0, 0.0, 1.0, 1.0), (639.0, 479.0, 3.0, 1.0)
+        place = rng.uniform(lowest, highest, (SIDE * SIDE, 4)).astype(np.float32)
+        views.append(SeenCells(cell, place, colour))
+    return views
+
+
+def stacked(views: Sequence[SeenCells]) -> TileStack:
+    """Put views on a stack."""
+    stack = TileStack(SIDE, SIDE, len(views))
+    for seen in views:
+        stack.add((0, 0), seen, LIMITS, np.zeros(3))
+    return stack
 
 
 def bench_combining(depths: Sequence[int]) -> None:
-    """Print millions of cells per second of the rule, numpy's reading of it, and a median."""
+    """Print millions of cells per second of the rule, of all that a tile needs, and of a median."""
     print("combining, Mcell/s on one core")
-    print(f"{'views':>7}{'as run':>10}{'numpy':>10}{'median':>10}{'as run / median':>17}")
+    print(f"{'views':>7}{'down':>10}{'on, down':>10}{'median':>10}{'down / median':>15}")
     for depth in depths:
-        colours, footprint = noisy_views(depth)
-        weight = np.float32(1.0) / footprint**4
+        views = noisy_views(depth)
+        stack, colours = stacked(views), np.stack([seen.colour for seen in views])
 
-        def run(rule: Callable[..., Any], arguments: tuple[Any, ...]) -> float:
-            return NUM_CELLS / 1e6 / fastest_s(lambda: rule(*arguments))
+        def speed(work: Callable[[], object]) -> float:
+            return SIDE * SIDE / 1e6 / fastest_s(work)
 
-        arguments = (colours, footprint, weight, NOISE_HALF_LEVELS, 3.0)
-        ours = run(selection_compiled.combined, arguments)
-        plain = run(selection.combined, arguments)
-        peer = run(lambda values: np.median(values, axis=0), (colours,))
-        print(f"{depth:7d}{ours:10.2f}{plain:10.2f}{peer:10.2f}{ours / peer:17.1f}", flush=True)
+        def both(views: Sequence[SeenCells] = views) -> object:
+            return stacked(views).finished(NOISE_LEVELS, 3.0)
+
+        down = speed(partial(stack.finished, NOISE_LEVELS, 3.0))
+        median = speed(partial(np.median, colours, axis=0))
+        print(f"{depth:7d}{down:10.2f}{speed(both):10.2f}{median:10.2f}{down / median:15.1f}")
 
 
 def ring_views(number: int) -> list[MosaicView]:

@@ -1,31 +1,11 @@
-"""The colour of a floor cell from several views of it, some of which show something else.
-
-The paper's rule (§5.1): discard the view that deviates most from the mean of those that are left,
-until half are gone. Here the rule selects; then every view that agrees with the surviving half
-counts, because on free floor half the views would be thrown away for nothing.
-"""
-
-from typing import Any
+"""The rule by which views of a cell are chosen, in numpy: what the compiled one is held against."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-from groundfuse.frontend.arrays import Mask, Picture32
-
-LEVEL = 2.0
-"""Colours are whole numbers of half levels: sums are exact, so that equal deviations are equal
-on every machine and the tie rule decides, not rounding."""
-BITS = 10
-"""Of a colour's half levels: blue, green and red fit into one word, blue lowest."""
-FEWEST_VIEWS = 3
-"""With fewer views no majority shows the floor."""
-SURVIVING_SPREAD = 4.0
-"""Variance of views over that of their surviving half. Grey noise gives 8 to 12 from five views on
-(the half is selected for its small spread), noise that differs between channels about 2.5. Too
-small a value averages fewer views; too large a one lets obstacles in."""
+from groundfuse.frontend.selection_compiled import FEWEST_VIEWS, SURVIVING_SPREAD
 
 
-def discard_half(colours: Picture32, footprint: Picture32) -> Mask:
+def discard_half(colours, footprint):
     """Return the views (n, cells) that survive the paper's rule.
 
     Of equal deviations the view with the larger footprint goes, of equal footprints the later one.
@@ -45,9 +25,7 @@ def discard_half(colours: Picture32, footprint: Picture32) -> Mask:
     return alive
 
 
-def _most_deviating(
-    colours: Picture32, footprint: Picture32, alive: Mask, total: Picture32, left: int
-) -> np.ndarray:
+def _most_deviating(colours, footprint, alive, total, left):
     """Return (cells,) the living view farthest from the mean of the living."""
     worst = np.zeros(colours.shape[2], dtype=np.intp)
     most = np.full(colours.shape[2], -1.0, dtype=np.float32)
@@ -65,7 +43,7 @@ def _most_deviating(
     return worst
 
 
-def agreeing_views(colours: Picture32, alive: Mask, noise: float, num_sigmas: float) -> Mask:
+def agreeing_views(colours, alive, noise, num_sigmas):
     """Return the views (n, cells) within `num_sigmas` of the surviving half's mean, and that half.
 
     A view's sigma is what the half spreads, allowing for its having been selected, or `noise`
@@ -85,17 +63,10 @@ def agreeing_views(colours: Picture32, alive: Mask, noise: float, num_sigmas: fl
     spread = np.einsum("kn,kn->n", squared, kept) / np.float32(survivors)
     variance = np.maximum(spread * np.float32(SURVIVING_SPREAD), np.float32(noise**2))
     limit = np.float32(num_sigmas**2 * (1.0 + 1.0 / survivors)) * variance
-    agreeing: Mask = alive | (squared <= limit)
-    return agreeing
+    return alive | (squared <= limit)
 
 
-def combined(
-    colours: NDArray[Any],
-    footprint: Picture32,
-    weight: Picture32,
-    noise: float,
-    num_sigmas: float,
-) -> Picture32:
+def combined(colours, footprint, weight, noise, num_sigmas):
     """Return the floor's colour (3, cells): the weighted mean of the views that agree.
 
     Fewer than three views can't outvote anything: their plain weighted mean.
@@ -112,5 +83,4 @@ def combined(
         alive = discard_half(colours, footprint)
         used = weight * agreeing_views(colours, alive, noise, num_sigmas)
     total = used.sum(axis=0)
-    mean: Picture32 = np.einsum("kcn,kn->cn", colours, used) / total
-    return mean
+    return np.einsum("kcn,kn->cn", colours, used) / total
