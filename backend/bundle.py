@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from groundfuse.backend.bundle_again import going_on
 from groundfuse.backend.bundle_cholesky import NotPositiveDefiniteError
 from groundfuse.backend.bundle_cut import Cut, cut, link_chi2
 from groundfuse.backend.bundle_estimate import (
@@ -55,27 +56,16 @@ from groundfuse.backend.bundle_tracks import (
 from groundfuse.backend.measurement import Attitude, FrameId, RelativePose, TeamEstimate
 
 Points = tuple[Integers, Integers]
+Solved = tuple[Problem, Solution, Cut, FileTest]
 
 LEAST_TRIAL, LEAST_SIGHTINGS = 60, 250
 """Sightings per frame that a large team keeps, in the trial and in the end."""
 DEFAULT = BundleOptions()
 
 
-@dataclass(frozen=True, slots=True)
-class Goal:
-    """How far to go and where to begin.
-
-    Attributes:
-        settled: chi-square of all poses together that the last step may still have.
-        noise: first guess of the keypoints' noise over its promise.
-    """
-
-    settled: float
-    noise: float = 1.0
-
-
-START, LAST = Goal(1.0), Goal(0.04)
-"""In the end a fifth of one sigma, in one direction of all."""
+SETTLED_TRIAL, SETTLED = 0.05, 0.04
+"""Chi-square that the last step may have: in trials of each frame, in the end of all of them
+together (a fifth of one sigma, in one direction of all)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,6 +88,11 @@ class Job:
     edges: Sequence[RelativePose]
     options: BundleOptions
 
+    @property
+    def settled_trial(self) -> float:
+        """Chi-square that the last step of a trial may still have."""
+        return max(1.0, SETTLED_TRIAL * len(self.team.frames))
+
 
 def bundle(
     start: TeamEstimate,
@@ -106,6 +101,7 @@ def bundle(
     sigma: Mapping[FrameId, Attitude],
     cameras: Mapping[str, BundleCamera],
     options: BundleOptions = DEFAULT,
+    earlier: BundleEstimate | None = None,
 ) -> BundleEstimate | BundleRefusal:
     """Refine the team's poses and find every frame's attitude and every robot's mount.
 
@@ -117,6 +113,8 @@ def bundle(
         sigma: standard deviations of their wobble.
         cameras: one per robot.
         options: see there.
+        earlier: what a bundle of most of these frames found, with the same files and options; it
+            saves time where it fits, see `bundle_again`.
 
     Raises:
         ValueError: a frame has no prior, or a sigma or height is not positive.
@@ -133,49 +131,80 @@ def bundle(
     sightings = with_gains(sightings, team.robot_of, tables)
     state = start_state(team, start, priors, cameras)
     job = Job(team, cameras, sightings, links, used, options)
+    warm = None if earlier is None else going_on(earlier, start, team, priors, cameras)
     try:
+        if earlier is not None and warm is not None:
+            again = _gone_on(job, *warm)
+            if again is not None:
+                return report(Ends(start, team, cameras, options, earlier.settled_frames), *again)
         found = _solved(job, priors, state)
     except NotPositiveDefiniteError:
         text = "the correspondences leave a pose or an attitude undetermined"
         return BundleRefusal(Illposed.SINGULAR, float(len(links)), float(len(links)), text)
     if isinstance(found, BundleRefusal):
         return found
-    return report(Ends(start, team, cameras, options), *found)
+    return report(Ends(start, team, cameras, options, len(team.frames)), *found)
 
 
-def _solved(
-    job: Job, priors: Priors, state: State
-) -> tuple[Problem, Solution, Cut, FileTest] | BundleRefusal:
+def _solved(job: Job, priors: Priors, state: State) -> Solved | BundleRefusal:
     """Cut wrong correspondences, see whether the floor is flat and the files hold, and solve."""
     options = job.options
-    clean = cut(job.links, job.edges, np.zeros(len(job.links), dtype=np.bool_), options)
-    thin = thinned(clean.links, job.sightings, options.start_sightings)
-    first = _stage(job, clean, priors, state, single_links(clean.links.only(thin)), START)
+    first = _rough(job, priors, state, noise=1.0)
     if isinstance(first, BundleRefusal):
         return first
     # Right correspondences contradict a wrong file: free its numbers before any of them are cut.
-    priors, rough, state = settled_files(*first, options, START.settled)
+    priors, rough, state = settled_files(*first, options, job.settled_trial)
     clean = _cleaned(job, priors, rough, state)
     joined = _joined(job, clean)
     num_frames = len(job.team.frames)
     most = max(options.trial_sightings // num_frames, LEAST_TRIAL)
     points = sampled(*joined, job.sightings, most)
-    trial = _stage(job, clean, priors, state, points, replace(START, noise=rough.noise))
+    trial = _stage(job, clean, priors, state, points, job.settled_trial)
     if isinstance(trial, BundleRefusal):
         return trial
-    relief, better = settle_relief(*trial, options, START.settled)
+    relief, better = settle_relief(*trial, options, job.settled_trial)
     state = better.state
     if relief > 0.0:
         priors, state = _judged_anew(trial[0], better, relief, options)
         clean = _cleaned(job, priors, better, state)
         joined = _joined(job, clean)
-    most = max(options.most_sightings // num_frames, LEAST_SIGHTINGS)
-    points = sampled(*joined, job.sightings, most)
-    last = _stage(job, clean, priors, state, points, replace(LAST, noise=better.noise))
+    last = _last(job, clean, priors, state, joined)
     if isinstance(last, BundleRefusal):
         return last
-    problem, solution, test = with_better_files(*last, options, LAST.settled)
+    problem, solution, test = with_better_files(*last, options, SETTLED)
     return problem, solution, clean, test
+
+
+def _gone_on(job: Job, priors: Priors, state: State) -> Solved | None:
+    """Take in what is new; None where what was judged before no longer holds."""
+    first = _rough(job, priors, state)
+    if isinstance(first, BundleRefusal):
+        return None
+    clean = _cleaned(job, priors, first[1], first[1].state)
+    last = _last(job, clean, priors, first[1].state, _joined(job, clean))
+    if isinstance(last, BundleRefusal):
+        return None
+    problem, solution, test = with_better_files(*last, job.options, SETTLED)
+    return (problem, solution, clean, test) if problem is last[0] else None
+
+
+def _rough(
+    job: Job, priors: Priors, state: State, noise: float | None = None
+) -> tuple[Problem, Solution] | BundleRefusal:
+    """Solve with some correspondences, right and wrong, each a floor point of its own."""
+    every = cut(job.links, job.edges, np.zeros(len(job.links), dtype=np.bool_), job.options)
+    thin = thinned(every.links, job.sightings, job.options.start_sightings)
+    points = single_links(every.links.only(thin))
+    return _stage(job, every, priors, state, points, job.settled_trial, noise)
+
+
+def _last(
+    job: Job, clean: Cut, priors: Priors, state: State, joined: Points
+) -> tuple[Problem, Solution] | BundleRefusal:
+    """Solve with as many sightings as take part."""
+    most = max(job.options.most_sightings // len(job.team.frames), LEAST_SIGHTINGS)
+    points = sampled(*joined, job.sightings, most)
+    return _stage(job, clean, priors, state, points, SETTLED)
 
 
 def _judged_anew(
@@ -201,7 +230,13 @@ def _cleaned(job: Job, priors: Priors, rough: Solution, state: State) -> Cut:
 
 
 def _stage(
-    job: Job, clean: Cut, priors: Priors, state: State, points: Points, goal: Goal
+    job: Job,
+    clean: Cut,
+    priors: Priors,
+    state: State,
+    points: Points,
+    settled: float,
+    noise: float | None = None,
 ) -> tuple[Problem, Solution] | BundleRefusal:
     """Solve with some floor points."""
     options, used = job.options, len(clean.links)
@@ -220,7 +255,7 @@ def _stage(
         with_points(state, seen, priors.robot_of),
         width=options.robust_sigma,
         iterations=options.iterations,
-        settled=goal.settled,
-        noise=goal.noise,
+        settled=settled,
+        noise=noise,
     )
     return problem, solution

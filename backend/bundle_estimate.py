@@ -196,6 +196,7 @@ class BundleEstimate:
         findings: what is observable and what is not.
         relief: standard deviation of the floor points' heights that was allowed for, fraction of
             the camera height; 0 where the floor is flat.
+        settled_frames: how many frames there were when floor and files were judged.
     """
 
     team: TeamEstimate
@@ -212,3 +213,4 @@ class BundleEstimate:
     rejected: tuple[Rejected, ...]
     findings: tuple[Finding, ...]
     relief: float = 0.0
+    settled_frames: int = 0

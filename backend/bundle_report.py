@@ -28,12 +28,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ends:
-    """What the caller gave, for the answer."""
+    """What the caller gave, for the answer; and on how many frames floor and files were judged."""
 
     start: TeamEstimate
     team: Team
     cameras: Mapping[str, BundleCamera]
     options: BundleOptions
+    settled_frames: int
 
 
 def report(
@@ -54,6 +55,7 @@ def report(
         residual_px=_residual_px(ends, problem, solution),
         noise_factor=solution.noise,
         relief=priors.relief,
+        settled_frames=ends.settled_frames,
         num_points=problem.seen.num_points,
         num_observations=len(problem.seen.frame),
         num_links=len(clean.links),

@@ -141,13 +141,17 @@ def start_state(
 
 
 def with_points(state: State, seen: Observations, robot_of: Integers) -> State:
-    """Put each floor point where its sightings meet the floor on average."""
-    found = floor_points(seen.frame, seen.ray, seen.gain, state, robot_of).point
-    good = np.isfinite(found).all(axis=1)
-    times = np.bincount(seen.point[good], minlength=seen.num_points)
-    sums = [np.bincount(seen.point[good], found[good, axis], seen.num_points) for axis in range(2)]
-    points = np.zeros((seen.num_points, 3))
-    points[:, :2] = np.stack(sums, axis=1) / np.maximum(times, 1)[:, None]
+    """Put each floor point where its sightings meet the floor, by the precision of each there."""
+    landing = floor_points(seen.frame, seen.ray, seen.gain, state, robot_of)
+    good = np.isfinite(landing.point).all(axis=1)
+    place, to_ray = landing.point[good], np.linalg.inv(landing.by_ray[good])
+    information = to_ray.transpose(0, 2, 1) @ to_ray / seen.sigma[good, None, None] ** 2
+    pulled = (information @ place[:, :, None])[:, :, 0]
+    columns = (*information.reshape(-1, 4)[:, [0, 1, 3]].T, *pulled.T)
+    xx, xy, yy, x, y = (np.bincount(seen.point[good], c, seen.num_points) for c in columns)
+    points, seen_at_all = np.zeros((seen.num_points, 3)), xx > 0.0
+    determinant = np.where(seen_at_all, xx * yy - xy * xy, 1.0)
+    points[:, 0], points[:, 1] = (yy * x - xy * y) / determinant, (xx * y - xy * x) / determinant
     return State(state.pose, state.attitude, state.shared, points)
 
 

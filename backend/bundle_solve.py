@@ -29,8 +29,6 @@ Array = NDArray[np.float64]
 LEAST_DAMPING, FIRST_DAMPING, MOST_DAMPING = 1e-10, 1e-6, 1e6
 CHORD_GAIN = 0.3
 """A step whose chi-square is more than this share of the last one's asks for new derivatives."""
-LEAST_SLOW = 1.0
-"""Below one sigma of one unknown slowness does not matter."""
 ROUNDING = 1e-7
 """Share of the cost by which it may rise in a step that is as good as none."""
 NOISE_CHANGE = 0.1
@@ -165,7 +163,7 @@ def minimise(
     width: float,
     iterations: int,
     settled: float,
-    noise: float = 1.0,
+    noise: float | None = None,
 ) -> Solution:
     """Minimise the robust cost until a step moves frames and robots by less than `settled`.
 
@@ -173,9 +171,9 @@ def minimise(
     in one direction. Points of wrong correspondences may go on drifting; they hold nothing.
 
     The kernel follows the residuals: wide while the start is rough, and in the end as wide as the
-    noise that is there. `noise` is a first guess of that, over what is promised: the start's
-    residuals come from its poses. Derivatives and factor are kept as long as steps with them
-    converge quickly.
+    noise that is there. `noise` is a first guess of that, over what is promised, for a start whose
+    residuals come from its poses; a good start's own residuals tell it. Derivatives and factor are
+    kept as long as steps with them converge quickly.
 
     Raises:
         NotPositiveDefiniteError: the unknowns are not determined.
@@ -189,7 +187,7 @@ def minimise(
     damping, steps, done = 0.0, 0, False
     while True:
         spread = noise_factor(problem.seen, errors, absorbed)
-        kernel = Kernel(width, spread, spread if steps else noise)
+        kernel = Kernel(width, spread, spread if steps or noise is None else noise)
         if done or steps == iterations:
             break
         if system is None or abs(kernel.noise / system.noise - 1.0) > NOISE_CHANGE:
@@ -202,7 +200,7 @@ def minimise(
             state, errors, steps = tried, tried_errors, steps + 1
             done = chi2 < settled and system.damping == 0.0
             damping = system.damping / 10.0 if system.damping > FIRST_DAMPING else 0.0
-            slow = chi2 > max(CHORD_GAIN * last_chi2, LEAST_SLOW) and not done
+            slow = chi2 > max(CHORD_GAIN * last_chi2, settled) and not done
             system, last_chi2 = (None, np.inf) if slow or damping else (system, chi2)
         elif last_chi2 < np.inf:
             system, last_chi2 = None, np.inf

@@ -1,0 +1,125 @@
+"""Going on from an earlier bundle of most of the same frames, instead of from the Pose2 graph.
+
+What took the time is known then: whether the floor is flat, which camera files the pictures
+contradict, and how poses and attitudes lie; a few steps take in what is new. The optimum is the
+same, up to the last step's length; what was judged is judged again once the team has grown.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from groundfuse.backend.bundle_estimate import BundleCamera, BundleEstimate, MountEstimate
+from groundfuse.backend.bundle_model import State
+from groundfuse.backend.bundle_priors import Priors
+from groundfuse.backend.bundle_setup import Team
+from groundfuse.backend.measurement import FrameId, Se2, TeamEstimate
+
+Array = NDArray[np.float64]
+
+MOST_GROWTH = 1.5
+"""A team this many times as large as when floor and files were judged last starts over."""
+
+
+def going_on(
+    earlier: BundleEstimate,
+    start: TeamEstimate,
+    team: Team,
+    priors: Priors,
+    cameras: Mapping[str, BundleCamera],
+) -> tuple[Priors, State] | None:
+    """Return priors and state of an earlier bundle, or None where too much is new.
+
+    A frame that it does not know is put where the Pose2 graph has it beside the nearest frame that
+    it does.
+
+    Args:
+        earlier: of the same camera files and options.
+        start: poses of the team graph.
+        team: its frames and robots by number.
+        priors: what the files say.
+        cameras: by robot.
+    """
+    if len(team.frames) > MOST_GROWTH * earlier.settled_frames:
+        return None
+    moves = [_move(earlier, start, team.frames[index]) for index in team.reference.values()]
+    if None in moves:
+        return None
+    by_component = dict(zip(team.reference, moves, strict=True))
+    home = {c: earlier.team.component_of[team.frames[i]] for c, i in team.reference.items()}
+    poses: dict[FrameId, Se2] = {}
+    for frame, pose in earlier.team.team_from_base.items():
+        component = start.component_of.get(frame)
+        move = None if component is None else by_component[component]
+        if move is not None and earlier.team.component_of[frame] == home[start.component_of[frame]]:
+            poses[frame] = move @ pose
+    poses |= _beside(poses, start)
+    mounts = {mount.robot: mount for mount in earlier.mounts}
+    shared = np.array([_shared(mounts.get(name)) for name in team.robots])
+    attitude = priors.attitude + shared[priors.robot_of, :3] * _unit(priors)
+    for index, frame in enumerate(team.frames):
+        if frame in earlier.attitude:
+            known = earlier.attitude[frame]
+            attitude[index] = known.tilt_rad, known.roll_rad, known.height_m
+    feet = [(poses[f] @ cameras[f.robot].base_from_foot).vector() for f in team.frames]
+    state = State(np.array(feet), attitude, shared, np.zeros((0, 3)))
+    return _judged(priors, team, mounts, earlier.relief), state
+
+
+def _move(earlier: BundleEstimate, start: TeamEstimate, reference: FrameId) -> Se2 | None:
+    """What brings a component's reference frame where it is now; None if it is new."""
+    before = earlier.team.team_from_base.get(reference)
+    return None if before is None else start.team_from_base[reference] @ before.inverse()
+
+
+def _beside(poses: Mapping[FrameId, Se2], start: TeamEstimate) -> dict[FrameId, Se2]:
+    """Place the frames that have no pose yet beside the nearest of their component that has."""
+    found: dict[FrameId, Se2] = {}
+    for component in sorted(set(start.component_of.values())):
+        members = sorted(f for f in start.team_from_base if start.component_of[f] == component)
+        known = [frame for frame in members if frame in poses]
+        new = [frame for frame in members if frame not in poses]
+        if not new:
+            continue
+        places = [start.team_from_base[frame].vector()[:2] for frame in known]
+        asked = [start.team_from_base[frame].vector()[:2] for frame in new]
+        nearest = cKDTree(np.array(places)).query(np.array(asked))[1].tolist()
+        for frame, place in zip(new, nearest, strict=True):
+            beside = start.team_from_base[known[place]]
+            found[frame] = poses[known[place]] @ beside.inverse() @ start.team_from_base[frame]
+    return found
+
+
+def _shared(mount: MountEstimate | None) -> Array:
+    """Return what a robot's poses rested on (6,), as in `State.shared`."""
+    shared = np.zeros(6)
+    if mount is not None:
+        numbers = (mount.tilt_rad, mount.roll_rad, mount.height, mount.focal, mount.distortion)
+        for axis, found in enumerate(numbers):
+            if found is not None and found.used and found.value is not None:
+                shared[axis] = found.value
+    return shared
+
+
+def _unit(priors: Priors) -> Array:
+    """Return what an offset of 1 adds to each attitude (frames, 3): a height's is a fraction."""
+    unit = np.ones((priors.num_frames, 3))
+    unit[:, 2] = priors.attitude[:, 2]
+    return unit
+
+
+def _judged(
+    priors: Priors, team: Team, mounts: Mapping[str, MountEstimate], relief: float
+) -> Priors:
+    """Free what was free before; the mounts all or none."""
+    any_mount = any(mount.tilt_rad.used for mount in mounts.values())
+    lens = np.zeros_like(priors.free_lens)
+    for index, name in enumerate(team.robots):
+        if name in mounts:
+            numbers = mounts[name].focal, mounts[name].distortion
+            lens[index] = [number is not None and number.used for number in numbers]
+    mount = np.full_like(priors.free_mount, any_mount)
+    return replace(priors, free_mount=mount, free_lens=lens, relief=relief)
