@@ -19,8 +19,9 @@ from groundfuse.backend.measurement import (
 )
 from groundfuse.backend.team import fuse
 from groundfuse.tools.front_end import FrontEndResult, Reused
-from groundfuse.tools.pipeline import Fused, odometry_edges
+from groundfuse.tools.pipeline import Fused
 from groundfuse.tools.robot import Frame, Odometry, Robot
+from groundfuse.tools.team_graphs import odometry_edges
 
 SIGMA_M, SIGMA_RAD = 0.002, 0.001
 A = [FrameId("A", k) for k in range(6)]

@@ -28,6 +28,7 @@ from groundfuse.tools.fuse_team import RunOptions
 from groundfuse.tools.pipeline import Stopwatch, fuse_robots
 from groundfuse.tools.settings import with_settings
 from groundfuse.tools.team_folder import read_team
+from groundfuse.tools.team_graphs import accepted_edges, odometry_edges
 
 # a^-1 b of two poses of size 3 and back: a few eps; worst seen 4e-16.
 EXACT = 1e-12
@@ -81,7 +82,7 @@ def test_a_stage_that_fails_is_timed_too():
 def test_odometry_gives_the_steps_between_frames_that_both_have_it(truth):
     start = Se2(5.0, 1.0, -2.0)  # odometry has an origin of its own
     known = {f: odometry(start @ truth[f], 0.02, 0.003) for f in [*A[:3], *A[4:], B[0]]}
-    edges = pipeline.odometry_edges(robots_of([*A, *B], odometry=known))
+    edges = odometry_edges(robots_of([*A, *B], odometry=known))
     assert [(e.a, e.b) for e in edges] == [(A[0], A[1]), (A[1], A[2]), (A[4], A[5])]
     for e in edges:
         motion = truth[e.a].inverse() @ truth[e.b]
@@ -93,13 +94,13 @@ def test_odometry_gives_the_steps_between_frames_that_both_have_it(truth):
 
 def test_a_steps_sigma_is_the_later_frames(truth):
     known = {A[0]: odometry(truth[A[0]], 0.5, 0.5), A[1]: odometry(truth[A[1]], 0.02, 0.003)}
-    (step,) = pipeline.odometry_edges(robots_of(A[:2], odometry=known))
+    (step,) = odometry_edges(robots_of(A[:2], odometry=known))
     assert step.covariance[0, 0] == pytest.approx(4e-4)
 
 
 def test_no_odometry_no_edges(truth):
-    assert pipeline.odometry_edges(robots_of([*A, *B])) == ()
-    assert pipeline.odometry_edges(robots_of(A[:1], odometry={A[0]: odometry(truth[A[0]])})) == ()
+    assert odometry_edges(robots_of([*A, *B])) == ()
+    assert odometry_edges(robots_of(A[:1], odometry={A[0]: odometry(truth[A[0]])})) == ()
 
 
 # What was used
@@ -114,7 +115,7 @@ def test_edges_are_used_or_turned_down(truth):
     wrong = edge(truth, A[4], B[3], Se2(0.5, 0.2, 0.3))
     edges = [wrong, *met(truth)]
     fused = fused_of(robots_of([*A, *B]), edges)
-    assert pipeline.accepted_edges(fused.team, fused.edges) == edges[1:]
+    assert accepted_edges(fused.team, fused.edges) == edges[1:]
     assert pipeline.used_edges(fused) == edges[1:]
     (down,) = pipeline.turned_down(fused.team)
     assert (down.a, down.b, down.reason) == (A[4], B[3], Reason.INCONSISTENT)

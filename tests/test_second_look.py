@@ -13,11 +13,12 @@ from groundfuse.backend.measurement import Attitude, Correspondences, FrameId, R
 from groundfuse.frontend.camera import Camera, Distortion, Intrinsics, Mount
 from groundfuse.tools.calibration_file import correction
 from groundfuse.tools.fuse_team import RunOptions
-from groundfuse.tools.pipeline import Stopwatch, accepted_edges, fuse_robots
+from groundfuse.tools.pipeline import Stopwatch, fuse_robots
 from groundfuse.tools.robot import Frame, Robot
 from groundfuse.tools.second_look import as_filed, corrected, is_worth_it
 from groundfuse.tools.settings import with_settings
 from groundfuse.tools.team_folder import read_team
+from groundfuse.tools.team_graphs import accepted_edges
 
 LENS = Intrinsics(
     640, 480, 548.0, 549.5, 316.8, 243.0, Distortion.EQUIDISTANT, (0.012, -0.004, 0.001, 0.0)

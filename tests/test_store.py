@@ -67,6 +67,17 @@ def test_what_was_put_in_is_there_next_time(path):
     assert {p.name for p in path.parent.iterdir()} == {"store.sqlite", "store.sqlite.lock"}
 
 
+def test_the_latest_of_a_kind_is_what_was_kept_last(path):
+    with Store(path) as store:
+        assert store.latest("number") is None
+        for key, value in ((b"1", 1.0), (b"2", 2.0), (b"1", 3.0)):
+            store.save(key, "number", "x", packed(value))
+            store.save(b"other", "word", "x", packed("text"))
+            assert store.latest("number") == value
+    with Store(path) as store:
+        assert store.latest("number") == 3.0
+
+
 def test_many_values_come_in_the_order_of_their_keys(monkeypatch):
     """Whatever lies together, and whichever are not there or asked for twice."""
     monkeypatch.setattr(module, "TOGETHER", 7)

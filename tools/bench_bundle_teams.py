@@ -12,14 +12,9 @@ from groundfuse.backend.measurement import Attitude, FrameId, Se2, TeamEstimate
 from groundfuse.frontend.ahead import Result
 from groundfuse.frontend.camera import Camera
 from groundfuse.tools.errors import TeamError
-from groundfuse.tools.pipeline import (
-    Fused,
-    PipelineOptions,
-    Stopwatch,
-    accepted_edges,
-    fuse_robots,
-)
+from groundfuse.tools.pipeline import Fused, PipelineOptions, Stopwatch, fuse_robots
 from groundfuse.tools.robot import Robot
+from groundfuse.tools.team_graphs import accepted_edges
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -12,7 +12,8 @@ from groundfuse.backend.drift import (
 )
 from groundfuse.backend.measurement import FrameId, Se2, TeamEstimate
 from groundfuse.tools.pair_scores import pair_scores
-from groundfuse.tools.pipeline import Fused, accepted_edges
+from groundfuse.tools.pipeline import Fused
+from groundfuse.tools.team_graphs import accepted_edges
 
 
 def drift_record(fused: Fused) -> dict[str, Any]:

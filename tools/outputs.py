@@ -24,7 +24,8 @@ from groundfuse.backend.trajectory import tum_text
 from groundfuse.frontend.decomposition import gamma
 from groundfuse.tools.errors import TeamError
 from groundfuse.tools.files import write_atomic
-from groundfuse.tools.pipeline import Fused, accepted_edges, bundle_rejected, used_edges
+from groundfuse.tools.pipeline import Fused, bundle_rejected, used_edges
+from groundfuse.tools.team_graphs import accepted_edges
 
 SIGMAS = ("sigma_x_m", "sigma_y_m", "sigma_theta_deg")
 POSE = ("x_m", "y_m", "theta_deg", *SIGMAS)

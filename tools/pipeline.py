@@ -2,41 +2,37 @@
 
 import logging
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
-from groundfuse.backend.bundle import bundle
 from groundfuse.backend.bundle_estimate import (
-    BundleCamera,
     BundleEstimate,
     BundleOptions,
     BundleRefusal,
     MountEstimate,
 )
-from groundfuse.backend.graph import RobotEstimate, robot_estimate
+from groundfuse.backend.graph import RobotEstimate
 from groundfuse.backend.measurement import (
     Attitude,
     FrameId,
     Rejected,
     RelativePose,
-    Se2,
     TeamEstimate,
 )
 from groundfuse.backend.option_checks import check_numbers
-from groundfuse.backend.team import TeamOptions, fuse
+from groundfuse.backend.team import TeamOptions
 from groundfuse.frontend.predicted import Pair, floor_outline, predicted_pairs
 from groundfuse.frontend.repetition import REPEATS
 from groundfuse.tools.code_version import code_of
-from groundfuse.tools.focal_gain import focal_gains
 from groundfuse.tools.front_end import FrontEnd, FrontEndResult
 from groundfuse.tools.front_end_options import FrontEndOptions
 from groundfuse.tools.packing import key_of
 from groundfuse.tools.robot import Frame, Robot
 from groundfuse.tools.second_look import as_filed, corrected, is_worth_it
 from groundfuse.tools.store import Store
+from groundfuse.tools.team_bundle import kept_bundle
+from groundfuse.tools.team_graphs import Graphs, accepted_edges, solved_graphs
 from groundfuse.tools.workers import Progress, Threads, Workers
 
 log = logging.getLogger(__name__)
@@ -204,52 +200,31 @@ def _looked(
         graphs = _graphs(robots, found, options, means)
     team, edges, rests_on = graphs.team, graphs.edges, graphs.rests_on
     known = [(r.camera, [(f.attitude, f.sigma) for f in r.frames]) for r in robots]
-
-    def refine() -> BundleEstimate | BundleRefusal:
-        accepted = as_filed(accepted_edges(team, edges), robots, mounts)
-        return _bundled(robots, team, accepted, options.bundle)
-
     refined: BundleEstimate | BundleRefusal | None = None
     if bundled:
         rests_on = (*rests_on, known, mounts, options.bundle)
         with watch.stage("bundle"):
-            refined = store.kept("bundle", "team", rests_on, refine)
-    key = key_of("fused", rests_on, known)
+            accepted = as_filed(accepted_edges(team, edges), robots, mounts)
+            # A look with corrected cameras starts over: what made it necessary may explain more.
+            refined = kept_bundle(
+                robots, team, accepted, options.bundle, store, rests_on, may_go_on=not mounts
+            )
+    code = code_of("groundfuse.tools.pipeline", rooms=("frontend", "backend", "tools"))
+    key = key_of("fused", code, rests_on, known)
     return Fused(robots, cameras, found, edges, graphs.alone, team, refined, key)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Graphs:
-    """The robots' graphs and the team's, and all that they depend on."""
-
-    edges: tuple[RelativePose, ...]
-    alone: dict[str, RobotEstimate]
-    team: TeamEstimate
-    rests_on: tuple[object, ...]
 
 
 def _graphs(
     robots: Sequence[Robot], found: FrontEndResult, options: PipelineOptions, means: Means
-) -> _Graphs:
-    """Optimise every robot by itself, and fuse."""
-    edges = (*found.edges, *odometry_edges(robots))
-    frames = [frame.id for robot in robots for frame in robot.frames]
-    code = code_of("groundfuse.tools.pipeline", rooms=("frontend", "backend", "tools"))
-    rests_on: tuple[object, ...] = (code, found.key, frames, _odometry(robots), options.team)
-
-    def solve() -> tuple[dict[str, RobotEstimate], TeamEstimate]:
-        alone = {r.name: robot_estimate(r.name, frames, edges, options.team) for r in robots}
-        return alone, fuse(frames, edges, options.team)
-
+) -> Graphs:
     with means.watch.stage("graphs"):
-        alone, team = means.store.kept("graphs", "team", rests_on, solve)
-    return _Graphs(edges, alone, team, rests_on)
+        return solved_graphs(robots, found, options.team, means.store)
 
 
 def _further_pairs(
     robots: Sequence[Robot],
     tried: set[Pair],
-    graphs: _Graphs,
+    graphs: Graphs,
     options: FrontEndOptions,
     means: Means,
 ) -> list[Pair]:
@@ -268,30 +243,6 @@ def _further_pairs(
             )
         accepted = [(edge.a, edge.b) for edge in accepted_edges(team, graphs.edges)]
         return predicted_pairs(outlines, team.component_of, accepted, tried, chosen)
-
-
-def _odometry(robots: Sequence[Robot]) -> list[tuple[Se2, Se2] | None]:
-    """Return all odometry as plain values."""
-    steps = (frame.odometry for robot in robots for frame in robot.frames)
-    return [None if step is None else (step.map_from_base, step.sigma) for step in steps]
-
-
-def odometry_edges(robots: Sequence[Robot]) -> tuple[RelativePose, ...]:
-    """Return the motion between consecutive frames that both have odometry."""
-    edges = []
-    for robot in robots:
-        for a, b in zip(robot.frames, robot.frames[1:], strict=False):
-            if a.odometry is None or b.odometry is None:
-                continue
-            motion = a.odometry.map_from_base.inverse() @ b.odometry.map_from_base
-            covariance = np.diag(b.odometry.sigma.vector() ** 2)
-            edges.append(RelativePose(a.id, b.id, motion, covariance))
-    return tuple(edges)
-
-
-def accepted_edges(team: TeamEstimate, edges: Sequence[RelativePose]) -> list[RelativePose]:
-    """Return the edges that took part in the solution."""
-    return [e for e, v in zip(edges, team.verdicts, strict=True) if v.accepted]
 
 
 def turned_down(team: TeamEstimate) -> list[Rejected]:
@@ -313,23 +264,3 @@ def used_edges(fused: Fused) -> list[RelativePose]:
     late = {(r.a, r.b) for r in bundle_rejected(fused)}
     accepted = accepted_edges(fused.team, fused.edges)
     return [e for e in accepted if e.correspondences is None or (e.a, e.b) not in late]
-
-
-def _bundled(
-    robots: Sequence[Robot],
-    team: TeamEstimate,
-    edges: Sequence[RelativePose],
-    options: BundleOptions,
-) -> BundleEstimate | BundleRefusal:
-    frames = [frame for robot in robots for frame in robot.frames]
-    prior: Mapping[FrameId, Attitude] = {frame.id: frame.attitude for frame in frames}
-    sigma: Mapping[FrameId, Attitude] = {frame.id: frame.sigma for frame in frames}
-    cameras = {
-        robot.name: BundleCamera(
-            robot.camera.mount.base_from_foot,
-            robot.camera.intrinsics.focal_px,
-            focal_gains(robot.camera.intrinsics),
-        )
-        for robot in robots
-    }
-    return bundle(team, edges, prior, sigma, cameras, options)

@@ -129,6 +129,13 @@ class Store:
             return None
         return row[0]
 
+    def latest(self, kind: str) -> Any:  # noqa: ANN401
+        """Return the value of a kind that was kept last; None where there is none."""
+        find = "SELECT key FROM entry WHERE kind = ? ORDER BY id DESC LIMIT 1"
+        with self._told(), self._guard:
+            row = self._base.execute(find, (kind,)).fetchone()
+        return None if row is None else self.load(row[0])
+
     def _rows(self, keys: Sequence[bytes]) -> dict[bytes, Row]:
         columns = "key, value, kind, label"
         find = f"SELECT {columns} FROM entry WHERE key IN ({_marks(keys)})"  # noqa: S608
