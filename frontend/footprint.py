@@ -4,6 +4,7 @@ import functools
 import math
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from groundfuse.backend.measurement import Attitude, Se2
@@ -36,7 +37,12 @@ class Footprint:
     def finest_m_per_px(self, share: float) -> float:
         """Return the length that this share of the pixels stays below; inf above the horizon."""
         on_floor = self.m_per_px[np.isfinite(self.m_per_px)]
-        return float(np.quantile(on_floor, share)) if on_floor.size else math.inf
+        if not on_floor.size:
+            return math.inf
+        rest, before = math.modf(share * (on_floor.size - 1))
+        first, after = int(before), min(int(before) + 1, on_floor.size - 1)
+        ordered = np.partition(on_floor, (first, after))
+        return float(ordered[first] + rest * (ordered[after] - ordered[first]))
 
     def bounds(self, limit_m: float) -> tuple[Points, Points] | None:
         """Return the lowest and highest (x, y) of the floor resolved within the limit, or None."""
@@ -45,12 +51,8 @@ class Footprint:
             near = self.m_per_px <= limit_m * BEYOND
         if not useful.any():
             return None
-        padded = np.pad(useful, 1)
-        rows, columns = useful.shape
-        for row in range(3):
-            for column in range(3):
-                useful = useful | (near & padded[row : row + rows, column : column + columns])
-        floor = self.floor_m[useful]
+        around = cv2.dilate(useful.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        floor = self.floor_m[useful | (near & around)]
         return floor.min(axis=0), floor.max(axis=0)
 
 

@@ -68,6 +68,21 @@ def test_place_and_footprint_agree_with_exact_projection(cell_m, step, coefficie
     np.testing.assert_allclose(places[seen][:, 2], 1.0 / least, rtol=0.03)
 
 
+@pytest.mark.parametrize("share", [0.0, 0.25, 0.6, 1.0])
+def test_the_finest_share_is_a_quantile_of_what_shows_floor(share):
+    upwards = Attitude(1.4, 0.0, 0.55)
+    for attitude in (ATTITUDE, upwards):
+        found = footprint(make_camera(), attitude, POSE)
+        on_floor = found.m_per_px[np.isfinite(found.m_per_px)]
+        # The same formula, rounded in another order.
+        assert found.finest_m_per_px(share) == pytest.approx(
+            np.quantile(on_floor, share), rel=1e-15
+        )
+    assert on_floor.size < found.m_per_px.size
+    nothing = footprint(make_camera(), Attitude(3.0, 0.0, 0.55), POSE)
+    assert nothing.finest_m_per_px(share) == np.inf
+
+
 def test_far_floor_is_cut_off_at_the_limit():
     camera = make_camera()
     grid = grid_over(camera, 0.004)

@@ -167,6 +167,24 @@ def test_parts_that_never_met_have_a_mosaic_each(tmp_path):
     assert alone.best.component_of[FRAMES["B"][0]] == 0
 
 
+def test_more_is_written_beside_a_mosaic_and_its_failure_is_told(tmp_path):
+    fused, seen = fused_at_truth(overlaps=()), []
+    watch = Stopwatch()
+
+    def note(component, mosaic):
+        seen.append((component, mosaic))
+
+    def fail(component, _):
+        raise DataError(f"no room for {component}")
+
+    how = {"quiet": True, "beside": (note,)}
+    mosaics = pictures.write_mosaics(tmp_path, fused, MOSAIC, 2, watch, **how)
+    assert seen == list(mosaics.items())
+    how["beside"] = (note, fail)
+    with pytest.raises(DataError, match="no room for 0"):
+        pictures.write_mosaics(tmp_path, fused, MOSAIC, 2, watch, **how)
+
+
 def test_what_a_mosaic_refuses_is_one_line_that_names_the_part(tmp_path):
     fused = fused_at_truth()
     options = MosaicOptions(m_per_px=0.01, max_cells=100)
@@ -207,8 +225,8 @@ def test_every_frame_has_an_overhead_view_of_its_own(tmp_path):
 def test_every_part_has_a_location_graph_as_large_as_its_mosaic_at_least(tmp_path):
     fused = fused_at_truth(overlaps=())
     mosaics = written(tmp_path, fused)
-    pictures.write_location_graphs(tmp_path, fused, mosaics)
     for component, stem in ((0, "location_graph"), (1, "location_graph_1")):
+        pictures.write_location_graph(tmp_path, fused, component, mosaics[component])
         picture = decoded(tmp_path / f"{stem}.png")
         assert picture.ndim == 3
         rows, columns = mosaics[component].floor.shape[:2]

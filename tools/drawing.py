@@ -33,6 +33,8 @@ LEAST_HEIGHT_PX = 420
 MARGIN_SHARE = 0.03
 """Free border around mosaic and trajectories, of the longer side."""
 TICKS = 7.0
+ROWS_AT_ONCE = 32
+"""Rows of the picture that stay in the processor's cache."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,12 +113,15 @@ def _draw_mosaic(canvas: Canvas, mosaic: Mosaic, placing: Placing, paleness: flo
     how = cv2.INTER_AREA if wide < columns else cv2.INTER_LINEAR
     seen = (mosaic.count > 0).astype(np.float32)
     alpha = np.asarray(cv2.resize(seen, (wide, tall), interpolation=how))[..., None]
-    floor = np.asarray(cv2.resize(mosaic.floor, (wide, tall), interpolation=how), np.float32)
-    window = canvas.image[top : top + tall, left : left + wide]
+    floor = np.asarray(cv2.resize(mosaic.floor, (wide, tall), interpolation=how))
     # Unseen cells are black in the floor: where some were averaged in, paper fills what is missing.
     paper = np.array(PAPER, np.float32) * np.float32(paleness)
-    shown = floor * np.float32(1.0 - paleness) + alpha * paper + window * (1.0 - alpha)
-    window[:] = np.clip(np.rint(shown), 0, 255).astype(np.uint8)
+    for row in range(0, tall, ROWS_AT_ONCE):
+        some = slice(row, min(row + ROWS_AT_ONCE, tall))
+        window = canvas.image[top + some.start : top + some.stop, left : left + wide]
+        share = alpha[some]
+        shown = floor[some] * np.float32(1.0 - paleness) + share * paper + window * (1.0 - share)
+        window[:] = np.clip(np.rint(shown), 0, 255).astype(np.uint8)
 
 
 def _draw_axes(canvas: Canvas, placing: Placing, width: int, height: int) -> None:

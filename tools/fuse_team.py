@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from groundfuse.backend.bundle_estimate import BundleEstimate
 from groundfuse.frontend.ahead import Result
-from groundfuse.frontend.mosaic import MosaicOptions
+from groundfuse.frontend.mosaic import Mosaic, MosaicOptions
 from groundfuse.tools.calibration_file import write_calibrations
 from groundfuse.tools.closing_table import closing_table
 from groundfuse.tools.code_version import code_of, libraries
@@ -47,7 +47,7 @@ from groundfuse.tools.outputs import (
     write_trajectories,
 )
 from groundfuse.tools.pictures import (
-    write_location_graphs,
+    write_location_graph,
     write_mosaics,
     write_overheads,
 )
@@ -220,14 +220,25 @@ def _write_pictures(desk: _Desk, fused: Fused) -> set[str]:
 
 
 def _write_mosaics(desk: _Desk, fused: Fused) -> None:
-    out, watch, options = desk.out, desk.watch, desk.options.mosaic
-    quiet, num_workers = desk.asked.quiet, desk.asked.workers
-    mosaics = write_mosaics(out, fused, options, num_workers, watch, quiet=quiet, store=desk.store)
-    with watch.stage("drawing"):
-        write_location_graphs(out, fused, mosaics)
-        for component, mosaic in mosaics.items():
-            path = out / f"{component_name('team', component)}.ply"
-            write_ply(path, mosaic, fused.best, component)
+    """Write the mosaics, and over each its location graph and its points."""
+    out, options = desk.out, desk.options.mosaic
+
+    def draw(component: int, mosaic: Mosaic) -> None:
+        write_location_graph(out, fused, component, mosaic)
+
+    def put_down(component: int, mosaic: Mosaic) -> None:
+        write_ply(out / f"{component_name('team', component)}.ply", mosaic, fused.best, component)
+
+    write_mosaics(
+        out,
+        fused,
+        options,
+        desk.asked.workers,
+        desk.watch,
+        quiet=desk.asked.quiet,
+        store=desk.store,
+        beside=(draw, put_down),
+    )
 
 
 def _second_opinion(fused: Fused) -> str:

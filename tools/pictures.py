@@ -1,9 +1,10 @@
 """Pictures of the fused team: mosaics with world files, their layers, the location graph, 3D."""
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -49,6 +50,7 @@ def write_mosaics(
     *,
     quiet: bool,
     store: Store | None = None,
+    beside: Sequence[Callable[[int, Mosaic], None]] = (),
 ) -> dict[int, Mosaic]:
     """Build and write the mosaic of every component with its layers; return them by component.
 
@@ -63,6 +65,7 @@ def write_mosaics(
         watch: takes the seconds.
         quiet: without a progress bar.
         store: has the tiles of the team's last mosaics, and takes these; see `mosaic_tiles`.
+        beside: write more of a component and its mosaic, while the layers are being written.
     """
     mosaics: dict[int, Mosaic] = {}
     memory = None if store is None else MosaicMemory(store)
@@ -84,7 +87,8 @@ def write_mosaics(
             except ValueError as error:
                 raise TeamError(f"mosaic of component {component}: {error}") from error
         with watch.stage("writing"):
-            _write_layers(out, name, mosaic, num_workers)
+            more = [partial(work, component, mosaic) for work in beside]
+            _write_layers(out, name, mosaic, num_workers, more)
         mosaics[component] = mosaic
     if memory is not None:
         memory.forget_others()
@@ -156,13 +160,12 @@ def _views(fused: Fused, component: int) -> list[MosaicView]:
     ]
 
 
-def write_location_graphs(out: Path, fused: Fused, mosaics: Mapping[int, Mosaic]) -> None:
-    """Write a picture of every component's trajectories and edges over its mosaic."""
+def write_location_graph(out: Path, fused: Fused, component: int, mosaic: Mosaic) -> None:
+    """Write a picture of a component's trajectories and edges over its mosaic."""
     feet = {robot.name: robot.camera.mount.base_from_foot for robot in fused.robots}
     edges: list[RelativePose | Rejected] = [*fused.edges, *fused.front_end.rejected]
-    for component, mosaic in mosaics.items():
-        picture = draw_location_graph(mosaic, fused.best, edges, component, feet)
-        write_png(out / f"{component_name('location_graph', component)}.png", picture)
+    picture = draw_location_graph(mosaic, fused.best, edges, component, feet)
+    write_png(out / f"{component_name('location_graph', component)}.png", picture)
 
 
 def write_overheads(out: Path, fused: Fused, options: OverheadOptions) -> None:
@@ -175,7 +178,13 @@ def write_overheads(out: Path, fused: Fused, options: OverheadOptions) -> None:
         write_png(out / "overhead" / f"{frame}.png", view)
 
 
-def _write_layers(out: Path, stem: str, mosaic: Mosaic, num_workers: int) -> None:
+def _write_layers(
+    out: Path,
+    stem: str,
+    mosaic: Mosaic,
+    num_workers: int,
+    more: Sequence[Callable[[], None]] = (),
+) -> None:
     """Write the layers, several at a time: compressing them takes as long as a few pictures do."""
     count = np.minimum(mosaic.count.astype(np.int64) * COUNT_GREY, 255).astype(np.uint8)
     alpha = np.where(mosaic.count > 0, 255, 0).astype(np.uint8)  # unseen: transparent
@@ -191,7 +200,9 @@ def _write_layers(out: Path, stem: str, mosaic: Mosaic, num_workers: int) -> Non
         ("_few", lambda: np.where(mosaic.uncertain, 255, 0).astype(np.uint8)),
     )
     with ThreadPoolExecutor(num_workers) as threads:
-        for done in [threads.submit(write, *layer) for layer in layers]:
+        begun = [threads.submit(work) for work in more]
+        begun += [threads.submit(write, *layer) for layer in layers]
+        for done in begun:
             done.result()
 
 
