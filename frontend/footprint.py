@@ -87,10 +87,21 @@ def widest_ray(camera: Camera) -> float:
 
 def footprint(camera: Camera, attitude: Attitude, team_from_foot: Se2) -> Footprint:
     """Return the floor that a picture shows."""
+    lattice, longest = _seen_floor(camera, attitude)
+    return Footprint(team_from_foot.apply(lattice.reshape(-1, 2)).reshape(lattice.shape), longest)
+
+
+@functools.lru_cache(maxsize=64)
+def _seen_floor(camera: Camera, attitude: Attitude) -> tuple[Floats, Floats]:
+    """Return the floor as its foot sees it and the length of pixels there, as in `Footprint`.
+
+    Before a bundle all frames of a robot that stands level share one attitude.
+    """
     rays, v, u = _lattice(camera)
-    floor = floor_from_rays(attitude, rays)
-    lattice = floor.reshape(len(v), len(u), 2)
+    lattice = floor_from_rays(attitude, rays).reshape(len(v), len(u), 2)
     by_v = np.asarray(np.gradient(lattice, v, axis=0), dtype=np.float64)
     by_u = np.asarray(np.gradient(lattice, u, axis=1), dtype=np.float64)
     longest, _ = singular_values(by_u, by_v)
-    return Footprint(team_from_foot.apply(floor).reshape(lattice.shape), longest)
+    for shared in (lattice, longest):
+        shared.flags.writeable = False
+    return lattice, longest
