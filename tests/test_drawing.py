@@ -11,6 +11,7 @@ from map_world import circle, edge, small_mosaic, small_team
 
 from groundfuse.backend.measurement import FrameId, Se2, TeamEstimate
 from groundfuse.tools import canvas as canvas_module
+from groundfuse.tools import drawing
 from groundfuse.tools.canvas import Canvas, dash_pieces, text_width_px
 from groundfuse.tools.drawing import LEFT_PX, TOP_PX, DrawingOptions, draw_location_graph
 from groundfuse.tools.drawing_component import EdgeKind, graph_of
@@ -87,6 +88,22 @@ def test_dashes_cover_their_share_of_the_line(points, dash, gap):
     drawn = sum(np.hypot(*np.diff(p, axis=0).T).sum() for p in dash_pieces(line, dash, gap))
     whole, rest = divmod(total, dash + gap)
     assert drawn == pytest.approx(whole * dash + min(rest, dash), abs=1e-6 + 2e-6 * dash)
+
+
+@given(st.floats(-50, 50), st.floats(-50, 50), st.floats(1, 20), st.floats(1, 20))
+def test_dashes_of_a_straight_line_know_no_more_of_its_middle_than_ends(x, y, dash, gap):
+    """A bend that is none changes no dash's ends, and only those that it lies in have it."""
+    ends = np.array([[0.0, 0.0], [x, y]])
+    plain = dash_pieces(ends, dash, gap)
+    bent = dash_pieces(np.insert(ends, 1, ends.mean(axis=0), axis=0), dash, gap)
+    assert sum(len(piece) for piece in bent) - sum(len(piece) for piece in plain) <= 1
+    for one, other in zip(plain, bent, strict=True):
+        # Half the way and the other half make the whole but for rounding: worst seen 2e-14.
+        np.testing.assert_allclose(one, other[[0, -1]], atol=1e-12)
+
+
+def test_a_canvas_begins_in_its_colour():
+    assert (Canvas(7, 5, (1, 20, 250)).finished() == (1, 20, 250)).all()
 
 
 def text_image(words, monkeypatch=None, **how):
@@ -259,6 +276,13 @@ def test_mosaic_and_graph_share_one_place():
     v = TOP_PX + (high_y + margin - centre[1]) * scale
     assert np.mean(found[1]) == pytest.approx(u, abs=1.0)
     assert np.mean(found[0]) == pytest.approx(v, abs=1.0)
+
+
+def test_rows_drawn_together_change_nothing(monkeypatch):
+    mosaic, (team, edges) = small_mosaic(), small_team()
+    whole = draw_location_graph(mosaic, team, edges)
+    monkeypatch.setattr(drawing, "ROWS_AT_ONCE", 7)
+    np.testing.assert_array_equal(draw_location_graph(mosaic, team, edges), whole)
 
 
 def pixels_of(image, colour, tolerance=40):

@@ -6,6 +6,7 @@ are BGR. Text uses OpenCV's own TrueType face where it has one (from version 5),
 
 import functools
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -33,8 +34,10 @@ class Canvas:
 
     def __init__(self, width_px: int, height_px: int, background: Colour) -> None:
         """Fill a new picture with one colour."""
-        shape = (height_px * SUPER, width_px * SUPER, 3)
-        self.image: Image = np.full(shape, background, dtype=np.uint8)
+        rows, columns = height_px * SUPER, width_px * SUPER
+        flat = np.empty((rows, columns * 3), dtype=np.uint8)
+        flat[:] = np.tile(np.array(background, dtype=np.uint8), columns)
+        self.image: Image = flat.reshape(rows, columns, 3)
         self.width_px, self.height_px = width_px, height_px
 
     def finished(self) -> Image:
@@ -55,12 +58,14 @@ class Canvas:
         """Draw a line through points (n, 2), with a border of another colour if wanted."""
         fixed = _fixed(points)
         if casing is not None:
-            self._polyline(fixed, casing, width_px + 2.0, closed=closed)
-        self._polyline(fixed, colour, width_px, closed=closed)
+            self._polylines([fixed], casing, width_px + 2.0, closed=closed)
+        self._polylines([fixed], colour, width_px, closed=closed)
 
-    def _polyline(self, fixed: Fixed, colour: Colour, width_px: float, *, closed: bool) -> None:
+    def _polylines(
+        self, fixed: Sequence[Fixed], colour: Colour, width_px: float, *, closed: bool
+    ) -> None:
         thickness = max(1, round(width_px * SUPER))
-        cv2.polylines(self.image, [fixed], closed, colour, thickness, cv2.LINE_AA, SHIFT)
+        cv2.polylines(self.image, fixed, closed, colour, thickness, cv2.LINE_AA, SHIFT)
 
     def dashes(
         self,
@@ -72,12 +77,10 @@ class Canvas:
         casing: Colour | None = None,
     ) -> None:
         """Draw a dashed line through points (n, 2)."""
-        pieces = dash_pieces(points, dash_px, gap_px)
+        pieces = [_fixed(piece) for piece in dash_pieces(points, dash_px, gap_px)]
         if casing is not None:
-            for piece in pieces:
-                self._polyline(_fixed(piece), casing, width_px + 2.0, closed=False)
-        for piece in pieces:
-            self._polyline(_fixed(piece), colour, width_px, closed=False)
+            self._polylines(pieces, casing, width_px + 2.0, closed=False)
+        self._polylines(pieces, colour, width_px, closed=False)
 
     def disc(
         self, centre: Floats, radius_px: float, colour: Colour, casing: Colour | None = None
@@ -146,13 +149,17 @@ def dash_pieces(points: Floats, dash_px: float, gap_px: float) -> list[Floats]:
     """Cut a line (n, 2) into dashes, each (m, 2); bends stay."""
     points = np.asarray(points, dtype=np.float64)
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-    pieces = []
-    for start in np.arange(0.0, along[-1], dash_px + gap_px):
-        stop = min(start + dash_px, along[-1])
-        inner = points[(along > start) & (along < stop)]
-        ends = [np.array([np.interp(at, along, axis) for axis in points.T]) for at in (start, stop)]
-        pieces.append(np.vstack([ends[0], inner, ends[1]]))
-    return pieces
+    starts = np.arange(0.0, along[-1], dash_px + gap_px)
+    stops = np.minimum(starts + dash_px, along[-1])
+    first, last = (
+        np.column_stack([np.interp(at, along, axis) for axis in points.T]) for at in (starts, stops)
+    )
+    if len(points) == 2:  # thousands of straight edges have no bends to look for
+        return list(np.stack([first, last], axis=1))
+    return [
+        np.vstack([first[k], points[(along > starts[k]) & (along < stops[k])], last[k]])
+        for k in range(len(starts))
+    ]
 
 
 def _fixed(points: Floats) -> Fixed:

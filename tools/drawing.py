@@ -112,16 +112,18 @@ def _draw_mosaic(canvas: Canvas, mosaic: Mosaic, placing: Placing, paleness: flo
     wide, tall = (max(1, round(value)) for value in (size * SUPER).tolist())
     how = cv2.INTER_AREA if wide < columns else cv2.INTER_LINEAR
     seen = (mosaic.count > 0).astype(np.float32)
-    alpha = np.asarray(cv2.resize(seen, (wide, tall), interpolation=how))[..., None]
+    alpha = np.asarray(cv2.resize(seen, (wide, tall), interpolation=how))
     floor = np.asarray(cv2.resize(mosaic.floor, (wide, tall), interpolation=how))
+    window = canvas.image[top : top + tall, left : left + wide]
     # Unseen cells are black in the floor: where some were averaged in, paper fills what is missing.
-    paper = np.array(PAPER, np.float32) * np.float32(paleness)
+    paper = np.tile(np.array(PAPER, np.float32) * np.float32(paleness), wide)
     for row in range(0, tall, ROWS_AT_ONCE):
-        some = slice(row, min(row + ROWS_AT_ONCE, tall))
-        window = canvas.image[top + some.start : top + some.stop, left : left + wide]
-        share = alpha[some]
-        shown = floor[some] * np.float32(1.0 - paleness) + share * paper + window * (1.0 - share)
-        window[:] = np.clip(np.rint(shown), 0, 255).astype(np.uint8)
+        rows = slice(row, row + ROWS_AT_ONCE)
+        lit = floor[rows].reshape(-1, 3 * wide).astype(np.float32) * np.float32(1.0 - paleness)
+        cover = np.repeat(alpha[rows], 3, axis=1)
+        shown = lit + cover * paper + window[rows].reshape(-1, 3 * wide) * (1.0 - cover)
+        whole = np.clip(np.rint(shown), 0, 255).astype(np.uint8)
+        window[rows] = whole.reshape(-1, wide, 3)
 
 
 def _draw_axes(canvas: Canvas, placing: Placing, width: int, height: int) -> None:

@@ -56,18 +56,18 @@ class Placing:
 
 def draw_graph(canvas: Canvas, graph: Graph, placing: Placing) -> None:
     """Draw edges, ellipses, trajectories, headings and numbers, the important last."""
+    at = {frame: placing.of(pose) for frame, pose in graph.poses.items()}
+    colour = {frame: _colour(graph, frame) for frame in graph.poses}
     for kind in EdgeKind:
         for a, b in graph.edges[kind]:
-            ends = np.array([placing.of(graph.poses[a]), placing.of(graph.poses[b])])
-            draw_edge(canvas, ends, kind, _colour(graph, a))
+            draw_edge(canvas, np.array([at[a], at[b]]), kind, colour[a])
     _draw_gaps(canvas, graph, placing)
     radius = marker_px(graph, placing.px_per_m)
     for frame in graph.poses:
         _draw_heading(canvas, graph, placing, frame, radius)
     scale = (NUM_SIGMAS * exaggeration(graph, placing.px_per_m) * placing.px_per_m) ** 2
     for frame, covariance in graph.covariance.items():
-        centre = placing.of(graph.poses[frame])
-        draw_ellipse(canvas, centre, covariance * scale, _colour(graph, frame))
+        draw_ellipse(canvas, at[frame], covariance * scale, colour[frame])
     if radius < NUMBERED_FROM_PX:
         _draw_dots(canvas, graph, placing, radius)
     else:

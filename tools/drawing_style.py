@@ -1,6 +1,7 @@
 """Colours and round numbers for drawings."""
 
 import colorsys
+import functools
 import math
 
 from groundfuse.tools.canvas import Colour
@@ -35,6 +36,7 @@ def robot_colour(number: int) -> Colour:
     return round(255 * blue), round(255 * green), round(255 * red)
 
 
+@functools.cache
 def mixed(a: Colour, b: Colour, share_of_b: float) -> Colour:
     """Return a colour between two."""
     blue, green, red = (round(x + (y - x) * share_of_b) for x, y in zip(a, b, strict=True))
