@@ -151,13 +151,15 @@ class Keeper:
         return found
 
     def _is_same(self, kept: MadeFrom, today: MadeFrom, parts: Sequence[Block]) -> bool:
-        corners = np.stack([self._corners_m(*part) for part in parts])
-        return is_same(kept, today, corners, self._plan.grid.m_per_px, self._options)
+        cell_m = self._plan.grid.m_per_px
+        return is_same(kept, today, self._corners_m(parts), cell_m, self._options)
 
-    def _corners_m(self, rows: slice, columns: slice) -> Floats:
-        """Return the corners (4, 2) of a block of cells."""
+    def _corners_m(self, parts: Sequence[Block]) -> Floats:
+        """Return the corners (n, 4, 2) of blocks of cells."""
         grid = self._plan.grid
-        x = grid.x_min_m + np.array([columns.start, columns.stop]) * grid.m_per_px
-        y = grid.y_max_m - np.array([rows.start, rows.stop]) * grid.m_per_px
-        corners: Floats = np.stack(np.meshgrid(x, y), axis=-1).reshape(4, 2)
+        ends = [(rows.start, rows.stop, columns.start, columns.stop) for rows, columns in parts]
+        rows, columns = np.hsplit(np.array(ends, np.float64), 2)
+        x = grid.x_min_m + columns * grid.m_per_px
+        y = grid.y_max_m - rows * grid.m_per_px
+        corners: Floats = np.stack([x[:, [0, 1, 0, 1]], y[:, [0, 0, 1, 1]]], axis=-1)
         return corners

@@ -134,6 +134,30 @@ def test_a_small_move_renders_nothing(cells, stays):
     assert bool(parts.tiles_saved()) != stays
 
 
+def test_a_turn_renders_what_is_far_from_its_middle():
+    """A tenth of a cell is reached 0.8 m off."""
+    turn, radius_m = Se2(0.0, 0.0, 0.1 * CELL_M / 0.8), 0.8
+    views, parts = team(1, x_m=0.3), Parts()
+    made(views, OPTIONS, parts)
+    every = parts.tiles_saved()
+    parts.saved.clear()
+    turned = dataclasses.replace(views[0], team_from_base=turn @ views[0].team_from_base)
+    made([turned], OPTIONS, parts)
+    side_m, near, far = 8 * CELL_M, 0, 0
+    for name in every:
+        row, column = map(int, name.split()[1:])
+        x = side_m * np.array([column, column + 1, column, column + 1])
+        y = -side_m * np.array([row, row, row + 1, row + 1])
+        distance_m = np.hypot(x, y)
+        if distance_m.max() < radius_m:
+            near += 1
+            assert name not in parts.tiles_saved()
+        if np.hypot(np.clip(0, x.min(), x.max()), np.clip(0, y.min(), y.max())) > radius_m:
+            far += 1
+            assert name in parts.tiles_saved()
+    assert min(near, far) > 0
+
+
 def test_small_moves_do_not_add_up():
     """Twenty steps of 0.03 cells: what is shown is never 0.1 cells off."""
     views, parts = team(), Parts()
