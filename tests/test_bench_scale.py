@@ -69,6 +69,7 @@ def test_the_bench_runs_on_a_fleet_and_names_what_cannot_be(tmp_path, capsys):
     assert int(tried) >= int(used) >= 4
     assert int(parts) <= 3
     found = reruns(tmp_path, 8, 1, 2)
-    assert list(found) == ["first run", "nothing changed", "one picture added"]
+    again = ["first run", "nothing changed", "one picture added"]
+    assert list(found) == [*again, "three robots of four", "the fourth added"]
     assert main(["--frames", "15", *keep]) == 2
     assert "a fleet needs a multiple of 4 frames, got 15" in capsys.readouterr().err

@@ -3,7 +3,7 @@
     bench_scale.py --frames 250 500 1000 2000     seconds per stage of four robots that mow a field
     bench_scale.py --retrieval 200                two robots of different tilt mow the same field
     bench_scale.py --speed --workers-gain 100     ms per frame and pair; one thread against two
-    bench_scale.py --rerun 400                    nothing changed; one picture added
+    bench_scale.py --rerun 400                    nothing changed; a picture, a robot added
 
 Fleets are pictures of 320 x 240, rendered on the fly into a folder that is removed at the end, or
 kept and used again with `--keep FOLDER`. Run it on an idle machine.
@@ -106,7 +106,7 @@ def bench_gain(size: int, seed: int, folder: Path) -> None:
 
 
 def bench_reruns(size: int, seed: int, num_workers: int, folder: Path) -> None:
-    """Print seconds of a run, the same run again, and with one picture more."""
+    """Print seconds of a run, the same run again, with one picture more, with one robot more."""
     fleet(folder, size, seed)
     for name, seconds in reruns(folder, size, seed, num_workers).items():
         print(f"{size} frames, {name}: {seconds:.1f} s", flush=True)
@@ -122,7 +122,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command.add_argument("--floors", nargs="+", default=["terrazzo"], help="of --retrieval")
     command.add_argument("--speed", action="store_true", help="ms per frame and pair")
     command.add_argument("--workers-gain", type=int, metavar="FRAMES", help="one thread or two")
-    command.add_argument("--rerun", type=int, metavar="FRAMES", help="again, and one more picture")
+    command.add_argument(
+        "--rerun", type=int, metavar="FRAMES", help="again, one more picture, one more robot"
+    )
     command.add_argument("--seed", type=int, default=1)
     command.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     command.add_argument("--keep", type=Path, help="folder of rendered fleets")

@@ -182,6 +182,8 @@ def matching_s(robots: Sequence[Robot], num_threads: int) -> dict[str, float]:
 def reruns(folder: Path, num_frames: int, seed: int, num_workers: int) -> dict[str, float]:
     """Return seconds of the command without a fleet's last picture, again, and with it.
 
+    And those of three robots of the four, and of the same store with the fourth.
+
     Raises:
         TeamError: as `fuse_team.py`.
     """
@@ -192,15 +194,25 @@ def reruns(folder: Path, num_frames: int, seed: int, num_workers: int) -> dict[s
         name_of_last = picture_name(FrameId(NAMES[-1], num_frames // len(NAMES) - 1))
         last = team / NAMES[-1] / IMAGES / name_of_last
         aside = last.rename(Path(temporary) / last.name)
-        out = ["--team", str(team), "--out", str(Path(temporary) / "out"), "--quiet"]
-        words = [*out, "--workers", str(num_workers)]
         for name in ("first run", "nothing changed", "one picture added"):
             if name == "one picture added":
                 aside.rename(last)
-            begin = time.perf_counter()
-            with contextlib.redirect_stdout(io.StringIO()):
-                code = fuse_team.main(words)
-            if code != 0:
-                raise DataError(f"{team}: could not be fused")
-            found[name] = time.perf_counter() - begin
+            found[name] = _fused_s(team, Path(temporary) / "out", NAMES, num_workers)
+        for name, robots in (("three robots of four", NAMES[:-1]), ("the fourth added", NAMES)):
+            found[name] = _fused_s(team, Path(temporary) / "others", robots, num_workers)
     return found
+
+
+def _fused_s(team: Path, out: Path, robots: Sequence[str], num_workers: int) -> float:
+    """Return seconds of the command.
+
+    Raises:
+        DataError: it refused.
+    """
+    folders = ["--team", str(team), "--out", str(out), "--robots", *robots]
+    begin = time.perf_counter()
+    with contextlib.redirect_stdout(io.StringIO()):
+        code = fuse_team.main([*folders, "--quiet", "--workers", str(num_workers)])
+    if code != 0:
+        raise DataError(f"{team}: could not be fused")
+    return time.perf_counter() - begin
