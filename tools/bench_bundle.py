@@ -3,6 +3,7 @@
     bench_bundle.py --teams 5                 2 x 13 views: as filed, files wrong, sharpness
     bench_bundle.py --teams 0 --large 7       2 x 200 views, 79 m
     bench_bundle.py --teams 0 --grow 200 400 800 1600
+    bench_bundle.py --teams 0 --nadir 10          2 x 3 views straight down, files too careful
     bench_bundle.py --teams 0 --real out/real/seneca out/real/planar_mosaic
 
 Rendered and real teams go through the whole front-end and the Pose2 graph first. Errors are root
@@ -13,6 +14,7 @@ Seeds from 900 on were not used while building.
 """
 
 import argparse
+import math
 import os
 import sys
 import tempfile
@@ -28,6 +30,7 @@ import numpy as np
 
 from groundfuse.backend.bundle import bundle
 from groundfuse.backend.bundle_estimate import BundleRefusal
+from groundfuse.backend.measurement import Attitude
 from groundfuse.tools import render_team
 from groundfuse.tools.bench_bundle_teams import (
     FILES,
@@ -36,6 +39,7 @@ from groundfuse.tools.bench_bundle_teams import (
     fused,
     measured,
     with_files,
+    with_wobble,
 )
 from groundfuse.tools.bench_sharpness import sharpness
 from groundfuse.tools.errors import TeamError
@@ -45,6 +49,8 @@ from groundfuse.tools.simulated_robot import SimulatedRobot, lawn_path
 from groundfuse.tools.team_folder import list_robots, read_team
 from groundfuse.tools.world import Scene
 
+FILED_DEG, FILED_HEIGHT = 0.05, 0.0008
+"""Wobble of tilt and roll, and of the height as a fraction, that files of still cameras state."""
 HEAD = (
     f"{'team':<22}{'frames':>7}{'pairs':>7}{'Pose2 mm':>16}{'bundle mm':>16}{'% path':>9}"
     f"{'NEES':>13}{'px':>7}{'noise':>7}{'relief':>8}{'s':>7}"
@@ -95,6 +101,27 @@ def bench_teams(floor: str, seeds: Sequence[int], num_workers: int) -> None:
     if sharp:
         values = ", ".join(f"{value:.3f}" for value in np.mean(sharp, axis=0))
         print(f"mean sharpness of the mosaic: Pose2, bundle, true poses: {values}")
+
+
+def bench_nadir(seeds: Sequence[int], num_workers: int) -> None:
+    """Print teams of 2 x 3 views straight down: few pictures, of cameras that do not wobble.
+
+    Their files state a wobble all the same, as those of a camera on a rail might.
+    """
+    print(HEAD)
+    still = ["--tilt-sigma", "0.001", "--roll-sigma", "0.001", "--height-sigma", "0.00001"]
+    words = ["--robots", "A:0", "B:0", "--views", "3", "--way", "lawn", "--obstacles", "0", *still]
+    for floor in ("terrazzo", "wood"):
+        some = []
+        for seed in seeds:
+            with tempfile.TemporaryDirectory() as folder:
+                robots, _ = rendered(Path(folder) / "team", floor, seed, words)
+                filed = robots[0].camera.mount.attitude.height_m * FILED_HEIGHT
+                wobble = Attitude(math.radians(FILED_DEG), math.radians(FILED_DEG), filed)
+                some.append(measured(*fused(with_wobble(robots, wobble), num_workers))[0])
+        worse = sum(found.errors_m[1][0] > found.errors_m[0][0] for found in some)
+        print(row(f"mean of {len(some)} {floor}", averages(some)))
+        print(f"  bundled worse than the Pose2 graph, rigid: {worse} of {len(some)}", flush=True)
 
 
 def bench_large(floor: str, seeds: Sequence[int], num_workers: int) -> None:
@@ -162,6 +189,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command.add_argument("--teams", type=int, default=5, help="rendered teams of 2 x 13 views")
     command.add_argument("--first-seed", type=int, default=900)
     command.add_argument("--large", nargs="*", type=int, default=[], help="seeds of 2 x 200 views")
+    command.add_argument("--nadir", type=int, default=0, help="teams of 2 x 3 views straight down")
     command.add_argument("--grow", nargs="*", type=int, default=[], help="simulated frames")
     command.add_argument("--real", nargs="*", type=Path, default=[], help="team folders")
     command.add_argument("--workers", type=int, default=os.cpu_count() or 1)
@@ -171,6 +199,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if asked.teams:
             seeds = range(asked.first_seed, asked.first_seed + asked.teams)
             bench_teams(asked.floor, seeds, asked.workers)
+        if asked.nadir:
+            seeds = range(asked.first_seed, asked.first_seed + asked.nadir)
+            bench_nadir(seeds, asked.workers)
         if asked.large:
             bench_large(asked.floor, asked.large, asked.workers)
         if asked.grow:

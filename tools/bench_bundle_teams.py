@@ -111,6 +111,16 @@ def _with_camera(robot: Robot, camera: Camera) -> Robot:
     return replace(robot, camera=camera, frames=tuple(frames))
 
 
+def with_wobble(robots: Sequence[Robot], sigma: Attitude) -> tuple[Robot, ...]:
+    """Return the robots with files that state another wobble; the pictures stay."""
+    changed = []
+    for robot in robots:
+        camera = replace(robot.camera, mount=replace(robot.camera.mount, sigma=sigma))
+        frames = tuple(replace(frame, sigma=sigma) for frame in robot.frames)
+        changed.append(replace(robot, camera=camera, frames=frames))
+    return tuple(changed)
+
+
 def _quiet(items: Iterable[Result], total: int, title: str) -> Iterable[Result]:  # noqa: ARG001
     return items
 
