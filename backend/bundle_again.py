@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from groundfuse.backend.bundle_estimate import BundleCamera, BundleEstimate, MountEstimate
 from groundfuse.backend.bundle_model import State
@@ -86,8 +86,8 @@ def _beside(poses: Mapping[FrameId, Se2], start: TeamEstimate) -> dict[FrameId, 
             continue
         places = [start.team_from_base[frame].vector()[:2] for frame in known]
         asked = [start.team_from_base[frame].vector()[:2] for frame in new]
-        nearest = cKDTree(np.array(places)).query(np.array(asked))[1].tolist()
-        for frame, place in zip(new, nearest, strict=True):
+        _, nearest = KDTree(np.array(places)).query(np.array(asked))
+        for frame, place in zip(new, np.atleast_1d(nearest).tolist(), strict=True):
             beside = start.team_from_base[known[place]]
             found[frame] = poses[known[place]] @ beside.inverse() @ start.team_from_base[frame]
     return found
