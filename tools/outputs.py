@@ -39,6 +39,10 @@ ATTITUDE_COLUMNS = (
 POSE_COLUMNS = ("robot", "index", "image", "component", *POSE)
 
 
+AS_THEY_ARE = frozenset({type(None), float, int, str})
+"""What Python's CSV writer writes as we would: nothing, or every digit."""
+
+
 def check_names(robots: Iterable[str]) -> None:
     """Refuse robots whose files would overwrite others' (TeamError)."""
     names = sorted(robots)
@@ -72,13 +76,13 @@ def csv_text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(columns)
-    writer.writerows([[_word(value) for value in row] for row in rows])
+    writer.writerows(
+        [value if type(value) in AS_THEY_ARE else _word(value) for value in row] for row in rows
+    )
     return stream.getvalue()
 
 
 def _word(value: object) -> str:
-    if value is None:
-        return ""
     return repr(float(value)) if isinstance(value, float) else str(value)
 
 
