@@ -259,8 +259,9 @@ def retrieved(
     known = memory.vocabulary(lambda: learned(sample, options))
     if known is None or not len(frames):
         return []
-    every = memory.described(lambda place: described(frames[place], known, options))
-    short, glances = stacked(every)
+    short, glances = stacked(
+        memory.described(lambda place: described(frames[place], known, options))
+    )
     found = most_similar(votes(short, glances, options, None, memory), options.num_frames)
     if robots is not None and len(np.unique(robots)) > 1:
         others = votes(short, glances, options, robots, memory)
