@@ -47,6 +47,12 @@ class Seen(dict):
 
 
 @pytest.fixture
+def store():
+    with Store() as empty:
+        yield empty
+
+
+@pytest.fixture
 def votes(monkeypatch):
     """How many frames voted: the length of a list that grows."""
     cast, voted = retrieval.cast, []
@@ -75,8 +81,7 @@ def numbered(names, new=None):
     return {frame: COUNT if frame == new else next(old) for frame in names}
 
 
-def test_a_first_run_reads_all_and_a_second_nothing(votes):
-    store = Store()
+def test_a_first_run_reads_all_and_a_second_nothing(votes, store):
     found, num_read = run(store, numbered(NAMES))
     assert len(found) >= COUNT
     assert num_read == COUNT + OPTIONS.num_sample
@@ -87,10 +92,9 @@ def test_a_first_run_reads_all_and_a_second_nothing(votes):
 
 
 @pytest.mark.parametrize("new", [FrameId("B", 30), FrameId("A", 31), FrameId("0", 0)])
-def test_one_frame_more_costs_itself_and_the_votes_of_those_it_resembles(votes, new):
+def test_one_frame_more_costs_itself_and_the_votes_of_those_it_resembles(votes, store, new):
     names = names_with(new)
     assert new not in sample_of(names, OPTIONS)
-    store = Store()
     run(store, numbered(NAMES))
     votes.clear()
     _, num_read = run(store, numbered(names, new))
@@ -100,8 +104,7 @@ def test_one_frame_more_costs_itself_and_the_votes_of_those_it_resembles(votes, 
     assert 2 <= len(votes) - by_heart <= 40
 
 
-def test_a_frame_that_is_gone_costs_no_reading():
-    store = Store()
+def test_a_frame_that_is_gone_costs_no_reading(store):
     run(store, numbered(NAMES))
     gone = next(frame for frame in NAMES if frame not in sample_of(NAMES, OPTIONS))
     left = {frame: k for frame, k in numbered(NAMES).items() if frame != gone}
@@ -109,9 +112,8 @@ def test_a_frame_that_is_gone_costs_no_reading():
     assert run(store, left)[1] == 0
 
 
-def test_another_sample_teaches_all_anew(votes):
+def test_another_sample_teaches_all_anew(votes, store):
     """The right pairs though what was kept was taught by another sample."""
-    store = Store()
     run(store, numbered(NAMES))
     new = next(
         f for k in range(30, 999) if (f := FrameId("B", k)) in sample_of([*NAMES, f], OPTIONS)
@@ -122,8 +124,7 @@ def test_another_sample_teaches_all_anew(votes):
     assert len(votes) == 4 * (COUNT + 1)
 
 
-def test_other_features_and_other_options_are_not_taken_for_the_same():
-    store = Store()
+def test_other_features_and_other_options_are_not_taken_for_the_same(store):
     run(store, numbered(NAMES))
     changed = {**numbered(NAMES), NAMES[20]: COUNT + 1}
     run(store, changed)
@@ -152,20 +153,18 @@ def test_a_damaged_piece_is_worked_out_again(tmp_path, kind, caplog):
 
 
 def test_the_number_of_threads_changes_nothing():
-    one, two = Store(), Store()
-    assert run(one, numbered(NAMES), num_threads=1) == run(two, numbered(NAMES), num_threads=3)
     every = "SELECT key, value FROM entry WHERE kind != 'retrieval' ORDER BY key"
-    assert one._base.execute(every).fetchall() == two._base.execute(every).fetchall()
+    with Store() as one, Store() as two:
+        assert run(one, numbered(NAMES), num_threads=1) == run(two, numbered(NAMES), num_threads=3)
+        assert one._base.execute(every).fetchall() == two._base.execute(every).fetchall()
 
 
-def test_blank_frames_and_none():
+def test_blank_frames_and_none(store):
     """Nothing is taught: no pairs, and nothing is described; one blank frame takes no part."""
-    assert run(Store(), {}) == ([], 0)
-    blank = [EMPTY, EMPTY]
-    assert run(Store(), {NAMES[0]: 0, NAMES[1]: 1}, blank) == ([], 2)
+    assert run(store, {}) == ([], 0)
+    assert run(store, {NAMES[0]: 0, NAMES[1]: 1}, [EMPTY, EMPTY]) == ([], 2)
     mixed = [EMPTY, *ROAD[:8]]
     order = {NAMES[k]: k for k in range(9)}
-    store = Store()
     found, _ = run(store, order, mixed)
     assert found
     assert all(NAMES[0] not in pair for pair in found)

@@ -81,14 +81,14 @@ def test_the_latest_of_a_kind_is_what_was_kept_last(path):
 def test_many_values_come_in_the_order_of_their_keys(monkeypatch):
     """Whatever lies together, and whichever are not there or asked for twice."""
     monkeypatch.setattr(module, "TOGETHER", 7)
-    store = Store()
-    for k in range(0, 40, 2):
-        put(store, k, key_of(k))
     asked = [39, 3, 8, 8, *range(30, -1, -1)]
     expected = [k if k % 2 == 0 else None for k in asked]
-    assert list(store.load_all(key_of(k) for k in asked)) == expected
-    assert store.known(key_of(k) for k in asked) == {key_of(k) for k in asked if k % 2 == 0}
-    assert list(store.load_all([])) == []
+    with Store() as store:
+        for k in range(0, 40, 2):
+            put(store, k, key_of(k))
+        assert list(store.load_all(key_of(k) for k in asked)) == expected
+        assert store.known(key_of(k) for k in asked) == {key_of(k) for k in asked if k % 2 == 0}
+        assert list(store.load_all([])) == []
 
 
 def test_of_many_values_only_those_that_are_not_there_are_made(monkeypatch, path):
@@ -116,7 +116,7 @@ def test_of_many_values_only_those_that_are_not_there_are_made(monkeypatch, path
 
 def test_work_that_fails_leaves_what_was_kept_before_it(monkeypatch):
     monkeypatch.setattr(module, "TOGETHER", 2)
-    store, keys = Store(), [key_of(k) for k in range(6)]
+    keys = [key_of(k) for k in range(6)]
 
     def works(missing):
         for k in missing:
@@ -124,10 +124,11 @@ def test_work_that_fails_leaves_what_was_kept_before_it(monkeypatch):
                 raise DataError("no such picture")
             yield k
 
-    with pytest.raises(DataError, match=r"^no such picture$"):
-        store.kept_each("number", "abcdef", keys, works)
-    assert list(store.load_all(keys)) == [0, 1, 2, 3, None, None]
-    assert not store._base.in_transaction
+    with Store() as store:
+        with pytest.raises(DataError, match=r"^no such picture$"):
+            store.kept_each("number", "abcdef", keys, works)
+        assert list(store.load_all(keys)) == [0, 1, 2, 3, None, None]
+        assert not store._base.in_transaction
 
 
 def test_without_a_path_it_lives_in_memory():
