@@ -27,6 +27,12 @@ def fused(robots, store):
     )
 
 
+@pytest.fixture
+def store():
+    with Store() as kept:
+        yield kept
+
+
 def without_last(robots):
     """The team before its last robot's last picture was there."""
     return [*robots[:-1], replace(robots[-1], frames=robots[-1].frames[:-1])]
@@ -45,8 +51,8 @@ def counted(monkeypatch):
     return names
 
 
-def test_one_picture_more_solves_its_robot_and_goes_on(counted):
-    robots, store = read_team(painted_pair(), ["A", "B"]), Store()
+def test_one_picture_more_solves_its_robot_and_goes_on(counted, store):
+    robots = read_team(painted_pair(), ["A", "B"])
     before = fused(without_last(robots), store).bundled
     counted.clear()
     after = fused(robots, store).bundled
@@ -56,7 +62,8 @@ def test_one_picture_more_solves_its_robot_and_goes_on(counted):
     total = sum(len(robot.frames) for robot in robots)
     assert before.settled_frames == total - 1
     assert after.settled_frames == total - 1  # it went on
-    alone = fused(robots, Store()).bundled
+    with Store() as empty:
+        alone = fused(robots, empty).bundled
     assert isinstance(alone, BundleEstimate)
     assert alone.settled_frames == total
     assert set(after.attitude) == set(alone.attitude)
@@ -65,8 +72,8 @@ def test_one_picture_more_solves_its_robot_and_goes_on(counted):
         assert (abs(apart.vector()) < TOLERANCE_SIGMA * covariance.diagonal() ** 0.5).all()
 
 
-def test_the_same_again_is_the_same_to_the_bit_whatever_came_later():
-    robots, store = read_team(painted_pair(), ["A", "B"]), Store()
+def test_the_same_again_is_the_same_to_the_bit_whatever_came_later(store):
+    robots = read_team(painted_pair(), ["A", "B"])
     first = fused(robots, store).bundled
     fused(without_last(robots), store)
     again = fused(robots, store).bundled
@@ -75,8 +82,8 @@ def test_the_same_again_is_the_same_to_the_bit_whatever_came_later():
     assert again.team.team_from_base == first.team.team_from_base
 
 
-def test_another_camera_file_starts_over():
-    robots, store = read_team(painted_pair(), ["A", "B"]), Store()
+def test_another_camera_file_starts_over(store):
+    robots = read_team(painted_pair(), ["A", "B"])
     fused(without_last(robots), store)
     camera = robots[0].camera
     filed = camera.mount.attitude
@@ -91,8 +98,8 @@ def test_another_camera_file_starts_over():
     assert after.settled_frames == sum(len(robot.frames) for robot in robots)
 
 
-def test_another_attitude_of_a_picture_starts_over():
-    robots, store = read_team(painted_pair(), ["A", "B"]), Store()
+def test_another_attitude_of_a_picture_starts_over(store):
+    robots = read_team(painted_pair(), ["A", "B"])
     fused(without_last(robots), store)
     some = robots[0].frames[1]
     leaning = replace(some, attitude=replace(some.attitude, tilt_rad=some.attitude.tilt_rad + 1e-4))

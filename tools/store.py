@@ -12,6 +12,7 @@ import logging
 import sqlite3
 import threading
 import time
+import weakref
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import islice
@@ -64,6 +65,8 @@ class Store:
                     _remove(path)
             with self._told():
                 self._base = _opened(path)
+            # One in memory ends with whoever holds it, and nobody may have closed it.
+            self._end = weakref.finalize(self, self._base.close)
         except BaseException:
             if self._lock is not None:
                 self._lock.release()
@@ -83,7 +86,7 @@ class Store:
     def close(self) -> None:
         """Put everything into the one file and let others have it."""
         with self._guard, contextlib.suppress(sqlite3.Error):
-            self._base.close()
+            self._end()
         if self._lock is not None:
             self._lock.release()
             self._lock = None
