@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from groundfuse.frontend.compiled import compiled
+from groundfuse.backend.compiled import compiled
 
 PART_BITS = 8
 """Samples lie on 1/256 px: the weights of a sample's four pixels add up to 2 ** 16."""

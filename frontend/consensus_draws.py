@@ -7,8 +7,8 @@ import math
 
 import numpy as np
 
+from groundfuse.backend.compiled import compiled, part
 from groundfuse.frontend.arrays import Floats, Mask
-from groundfuse.frontend.compiled import compiled, part
 from groundfuse.frontend.consensus_table import Limits, Table
 
 PARTS = 8

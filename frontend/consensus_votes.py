@@ -8,8 +8,8 @@ import math
 
 import numpy as np
 
+from groundfuse.backend.compiled import compiled, part
 from groundfuse.frontend.arrays import Floats, Mask, Picture32
-from groundfuse.frontend.compiled import compiled, part
 from groundfuse.frontend.consensus_table import Limits, Table
 
 

@@ -9,8 +9,8 @@ import math
 
 import numpy as np
 
+from groundfuse.backend.compiled import compiled, part
 from groundfuse.frontend.arrays import Floats, Picture32
-from groundfuse.frontend.compiled import compiled, part
 
 BINS = 36
 WINDOW = 1.5

@@ -6,8 +6,8 @@ by up to a tenth of a pixel; another one through points half as far apart does n
 
 import numpy as np
 
+from groundfuse.backend.compiled import compiled, part
 from groundfuse.frontend.arrays import Floats, Mask, Picture32
-from groundfuse.frontend.compiled import compiled, part
 
 BORDER_PX = 5
 """Extrema this near to a picture's border are not looked for."""

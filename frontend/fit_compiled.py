@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from groundfuse.backend.compiled import compiled, part
 from groundfuse.frontend.arrays import Floats, Mask, Points
-from groundfuse.frontend.compiled import compiled, part
 
 BEHIND = 1e9
 """Residual of a point behind a camera: no pull, never an inlier."""

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
+from groundfuse.backend.compiled import compiled
 from groundfuse.frontend.arrays import Picture32
-from groundfuse.frontend.compiled import compiled
 
 
 @compiled

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from groundfuse.backend.compiled import compiled, part
 from groundfuse.frontend.arrays import Image, Picture32
-from groundfuse.frontend.compiled import compiled, part
 
 UNROLLED = 4
 """Columns of a block whose sum is written out: a vector operation, 25 times as fast as a loop."""

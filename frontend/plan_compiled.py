@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
+from groundfuse.backend.compiled import compiled, part
 from groundfuse.frontend.area_compiled import PART_BITS
 from groundfuse.frontend.arrays import Floats, Matrix
-from groundfuse.frontend.compiled import compiled, part
 
 Places = tuple[np.ndarray, np.ndarray]
 

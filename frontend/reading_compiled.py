@@ -12,7 +12,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from groundfuse.frontend.compiled import compiled
+from groundfuse.backend.compiled import compiled
 
 CHANNELS = 4
 """Bytes of a pixel: blue, green, red, and one that makes a row of four pixels sixteen bytes."""

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from groundfuse.frontend.compiled import compiled
+from groundfuse.backend.compiled import compiled
 
 
 @compiled

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from groundfuse.frontend.compiled import compiled
+from groundfuse.backend.compiled import compiled
 
 LEVEL = 2.0
 """Colours are whole numbers of half levels: sums are exact, so that equal deviations are equal

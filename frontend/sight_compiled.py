@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from groundfuse.frontend.compiled import compiled
+from groundfuse.backend.compiled import compiled
 from groundfuse.frontend.reading_compiled import MOST_PLACES
 
 MOST_HALVINGS = 24

@@ -8,6 +8,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 ROOMS = ("frontend", "backend", "tools")
 BORDER = {
+    "groundfuse.backend.compiled",
     "groundfuse.backend.measurement",
     "groundfuse.backend.option_checks",
     "groundfuse.backend.reprojection",
