@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 
 from groundfuse.backend.bundle_estimate import BundleCamera, BundleEstimate, MountEstimate
 from groundfuse.backend.bundle_model import State
-from groundfuse.backend.bundle_priors import Priors
+from groundfuse.backend.bundle_priors import Priors, offset_units
 from groundfuse.backend.bundle_setup import Team
 from groundfuse.backend.measurement import FrameId, Se2, TeamEstimate
 
@@ -45,21 +45,13 @@ def going_on(
     """
     if len(team.frames) > MOST_GROWTH * earlier.settled_frames:
         return None
-    moves = [_move(earlier, start, team.frames[index]) for index in team.reference.values()]
-    if None in moves:
+    poses = _known(earlier.team, start, team)
+    if poses is None:
         return None
-    by_component = dict(zip(team.reference, moves, strict=True))
-    home = {c: earlier.team.component_of[team.frames[i]] for c, i in team.reference.items()}
-    poses: dict[FrameId, Se2] = {}
-    for frame, pose in earlier.team.team_from_base.items():
-        component = start.component_of.get(frame)
-        move = None if component is None else by_component[component]
-        if move is not None and earlier.team.component_of[frame] == home[start.component_of[frame]]:
-            poses[frame] = move @ pose
     poses |= _beside(poses, start)
     mounts = {mount.robot: mount for mount in earlier.mounts}
     shared = np.array([_shared(mounts.get(name)) for name in team.robots])
-    attitude = priors.attitude + shared[priors.robot_of, :3] * _unit(priors)
+    attitude = priors.attitude + shared[priors.robot_of, :3] * offset_units(priors)
     for index, frame in enumerate(team.frames):
         if frame in earlier.attitude:
             known = earlier.attitude[frame]
@@ -69,10 +61,23 @@ def going_on(
     return _judged(priors, team, mounts, earlier.relief), state
 
 
-def _move(earlier: BundleEstimate, start: TeamEstimate, reference: FrameId) -> Se2 | None:
-    """What brings a component's reference frame where it is now; None if it is new."""
-    before = earlier.team.team_from_base.get(reference)
-    return None if before is None else start.team_from_base[reference] @ before.inverse()
+def _known(earlier: TeamEstimate, start: TeamEstimate, team: Team) -> dict[FrameId, Se2] | None:
+    """Return earlier poses, moved with the references of today; None where one of those is new.
+
+    Frames that were in another component than its reference are left out.
+    """
+    before, moves, home = earlier.team_from_base, dict[int, Se2](), dict[int, int]()
+    for component, index in team.reference.items():
+        reference = team.frames[index]
+        if reference not in before:
+            return None
+        moves[component] = start.team_from_base[reference] @ before[reference].inverse()
+        home[component] = earlier.component_of[reference]
+    return {
+        frame: moves[component] @ before[frame]
+        for frame, component in start.component_of.items()
+        if frame in before and earlier.component_of[frame] == home[component]
+    }
 
 
 def _beside(poses: Mapping[FrameId, Se2], start: TeamEstimate) -> dict[FrameId, Se2]:
@@ -102,13 +107,6 @@ def _shared(mount: MountEstimate | None) -> Array:
             if found is not None and found.used and found.value is not None:
                 shared[axis] = found.value
     return shared
-
-
-def _unit(priors: Priors) -> Array:
-    """Return what an offset of 1 adds to each attitude (frames, 3): a height's is a fraction."""
-    unit = np.ones((priors.num_frames, 3))
-    unit[:, 2] = priors.attitude[:, 2]
-    return unit
 
 
 def _judged(

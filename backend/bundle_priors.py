@@ -129,10 +129,15 @@ def prior_residual(state: State, priors: Priors) -> Array:
 
 def _by_offset(priors: Priors) -> Array:
     """Derivative (frames, 3) of the whitened residual by the robot's offsets."""
-    scale = np.ones((priors.num_frames, 3))
-    scale[:, 2] = priors.attitude[:, 2]  # a height's offset is a fraction
-    by_offset: Array = scale / priors.sigma * priors.free_mount[priors.robot_of]
+    by_offset: Array = offset_units(priors) / priors.sigma * priors.free_mount[priors.robot_of]
     return by_offset
+
+
+def offset_units(priors: Priors) -> Array:
+    """What a mount's offset of 1 adds to each attitude (frames, 3): a height's is a fraction."""
+    units = np.ones((priors.num_frames, 3))
+    units[:, 2] = priors.attitude[:, 2]
+    return units
 
 
 def between_residual(state: State, between: Between) -> Array:

@@ -106,19 +106,19 @@ def _changed(camera: Camera, change: FileChange) -> Camera:
     return replace(camera, intrinsics=lens, mount=replace(camera.mount, attitude=attitude))
 
 
-def _with_camera(robot: Robot, camera: Camera) -> Robot:
-    frames = [replace(frame, attitude=camera.mount.attitude) for frame in robot.frames]
-    return replace(robot, camera=camera, frames=tuple(frames))
-
-
 def with_wobble(robots: Sequence[Robot], sigma: Attitude) -> tuple[Robot, ...]:
     """Return the robots with files that state another wobble; the pictures stay."""
-    changed = []
-    for robot in robots:
-        camera = replace(robot.camera, mount=replace(robot.camera.mount, sigma=sigma))
-        frames = tuple(replace(frame, sigma=sigma) for frame in robot.frames)
-        changed.append(replace(robot, camera=camera, frames=frames))
-    return tuple(changed)
+    mounts = [replace(robot.camera.mount, sigma=sigma) for robot in robots]
+    return tuple(
+        _with_camera(robot, replace(robot.camera, mount=mount))
+        for robot, mount in zip(robots, mounts, strict=True)
+    )
+
+
+def _with_camera(robot: Robot, camera: Camera) -> Robot:
+    mount = camera.mount
+    frames = [replace(f, attitude=mount.attitude, sigma=mount.sigma) for f in robot.frames]
+    return replace(robot, camera=camera, frames=tuple(frames))
 
 
 def _quiet(items: Iterable[Result], total: int, title: str) -> Iterable[Result]:  # noqa: ARG001

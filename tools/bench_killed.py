@@ -1,7 +1,9 @@
 """Kill the main job at random moments, run it again, and compare every byte with a quiet run's.
 
-bench_killed.py --kills 20 --seed 100            first runs
-bench_killed.py --kills 20 --seed 100 --grown    a finished team with new pictures, and mosaics
+    bench_killed.py --kills 20 --seed 100            first runs
+    bench_killed.py --kills 20 --seed 100 --grown    a finished team with new pictures, and mosaics
+
+The folders that it works in are temporary.
 """
 
 import argparse

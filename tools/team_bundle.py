@@ -81,8 +81,9 @@ def _earlier(
     """Return an earlier bundle to go on from, if it was made of the same files."""
     same_cameras = all(cameras.get(r, key) == key for r, key in latest.cameras.items())
     same_files = all(filed.get(frame, known) == known for frame, known in latest.filed.items())
-    fits = same_cameras and same_files and isinstance(latest.result, BundleEstimate)
-    return latest.result if fits and isinstance(latest.result, BundleEstimate) else None
+    if same_cameras and same_files and isinstance(latest.result, BundleEstimate):
+        return latest.result
+    return None
 
 
 def _bundled(
