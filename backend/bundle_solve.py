@@ -26,7 +26,7 @@ from groundfuse.backend.bundle_tracks import Observations
 
 Array = NDArray[np.float64]
 
-LEAST_DAMPING, FIRST_DAMPING, MOST_DAMPING = 1e-10, 1e-6, 1e6
+FIRST_DAMPING, MOST_DAMPING = 1e-6, 1e6
 CHORD_GAIN = 0.3
 """A step whose chi-square is more than this share of the last one's asks for new derivatives."""
 ROUNDING = 1e-7
