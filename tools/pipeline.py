@@ -22,8 +22,10 @@ from groundfuse.backend.measurement import (
 )
 from groundfuse.backend.option_checks import check_numbers
 from groundfuse.backend.team import TeamOptions
+from groundfuse.frontend.patches import PatchOptions
 from groundfuse.frontend.predicted import Pair, floor_outline, predicted_pairs
 from groundfuse.frontend.repetition import REPEATS
+from groundfuse.tools.aligned_edges import Desk, aligned_edges
 from groundfuse.tools.code_version import code_of
 from groundfuse.tools.front_end import FrontEnd, FrontEndResult
 from groundfuse.tools.front_end_options import FrontEndOptions
@@ -45,6 +47,7 @@ class PipelineOptions:
     Attributes:
         front_end: pictures to relative poses.
         team: relative poses to one map.
+        patches: correspondences made exact before the bundle.
         bundle: attitudes, mounts and poses from all correspondences at once.
         more_looks: where the bundle finds a camera file wrong, match and fuse again with the
             corrected file, this often at most.
@@ -52,6 +55,7 @@ class PipelineOptions:
 
     front_end: FrontEndOptions = field(default_factory=FrontEndOptions)
     team: TeamOptions = field(default_factory=TeamOptions)
+    patches: PatchOptions = field(default_factory=PatchOptions)
     bundle: BundleOptions = field(default_factory=BundleOptions)
     more_looks: int = 2
 
@@ -62,18 +66,22 @@ class PipelineOptions:
 
 @dataclass(slots=True)
 class Stopwatch:
-    """Seconds per stage, in the order in which the stages ran."""
+    """Seconds per stage, in the order in which the stages ended."""
 
     seconds: dict[str, float] = field(default_factory=dict)
+    _within_s: float = 0.0
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Add the time of the block to a stage."""
-        begin = time.perf_counter()
+        """Add the time of the block to a stage, but for that of other stages within it."""
+        begin, before = time.perf_counter(), self._within_s
+        self._within_s = 0.0
         try:
             yield
         finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
+            took = time.perf_counter() - begin
+            self.seconds[name] = self.seconds.get(name, 0.0) + took - self._within_s
+            self._within_s = before + took
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +89,7 @@ class Means:
     """What a run works with: who, with what is known already, and who is told about it."""
 
     workers: Workers
+    num_threads: int
     store: Store
     progress: Progress
     watch: Stopwatch
@@ -161,7 +170,8 @@ def fuse_robots(
         DataError: a picture can't be read, or the store can't be written.
     """
     robots = tuple(robots)
-    means = Means(workers or Threads(num_workers), store or Store(), progress, watch)
+    who = workers or Threads(num_workers)
+    means = Means(who, num_workers, store or Store(), progress, watch)
     fused = _looked(robots, robots, (), options, means, bundled=bundled)
     assumed: Sequence[MountEstimate] = ()
     for _ in range(options.more_looks):
@@ -202,12 +212,24 @@ def _looked(
     known = [(r.camera, [(f.attitude, f.sigma) for f in r.frames]) for r in robots]
     refined: BundleEstimate | BundleRefusal | None = None
     if bundled:
-        rests_on = (*rests_on, known, mounts, options.bundle)
-        with watch.stage("bundle"):
+        rests_on = (*rests_on, known, mounts, options.patches, options.bundle)
+
+        def exact() -> Sequence[RelativePose]:
             accepted = as_filed(accepted_edges(team, edges), robots, mounts)
+            with watch.stage("patches"):
+                desk = Desk(
+                    found.pictures,
+                    store,
+                    means.num_threads,
+                    means.progress,
+                    options.bundle.most_sightings,
+                )
+                return aligned_edges(robots, cameras, team, accepted, options.patches, desk)
+
+        with watch.stage("bundle"):
             # A look with corrected cameras starts over: what made it necessary may explain more.
             refined = kept_bundle(
-                robots, team, accepted, options.bundle, store, rests_on, may_go_on=not mounts
+                robots, team, exact, options.bundle, store, rests_on, may_go_on=not mounts
             )
     code = code_of("groundfuse.tools.pipeline", rooms=("frontend", "backend", "tools"))
     key = key_of("fused", code, rests_on, known)

@@ -4,7 +4,7 @@ A team that has grown goes on from the bundle that its store holds of most of th
 long as cameras, files and options are what they were.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from groundfuse.backend.bundle import bundle
@@ -42,7 +42,7 @@ class KeptBundle:
 def kept_bundle(
     robots: Sequence[Robot],
     team: TeamEstimate,
-    edges: Sequence[RelativePose],
+    edges: Callable[[], Sequence[RelativePose]],
     options: BundleOptions,
     store: Store,
     rests_on: Sequence[object],
@@ -54,7 +54,7 @@ def kept_bundle(
     Args:
         robots: as filed.
         team: of the Pose2 graph.
-        edges: its accepted ones.
+        edges: its accepted ones; not asked for where the store has the bundle.
         options: see there.
         store: what is known.
         rests_on: all that this depends on, as parts of a key.
@@ -67,7 +67,7 @@ def kept_bundle(
     def work() -> KeptBundle:
         latest: KeptBundle | None = store.latest(KIND) if may_go_on else None
         earlier = None if latest is None else _earlier(latest, cameras, filed)
-        return KeptBundle(_bundled(robots, team, edges, options, earlier), cameras, filed)
+        return KeptBundle(_bundled(robots, team, edges(), options, earlier), cameras, filed)
 
     found: KeptBundle = store.kept(KIND, "team", (code, *rests_on), work)
     return found.result

@@ -1,0 +1,240 @@
+"""Keypoints made exact: a floor point's pictures are laid on each other, patch on patch.
+
+A detector places a keypoint to a third of a pixel, and differently under each view. What a
+small patch around it looks like says more: least squares matching (Foerstner 1982, Gruen 1985)
+moves the keypoint, in every picture but one, to where the patch looks as it does in that one, the
+finest. In between lies the homography of the floor, with each lens linear over the patch.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from groundfuse.backend.measurement import Attitude, Se2
+from groundfuse.backend.option_checks import check_numbers
+from groundfuse.frontend.arrays import Floats, Image, Mask, Picture32, Points
+from groundfuse.frontend.camera import Camera, Intrinsics
+from groundfuse.frontend.patches_compiled import fill_templates, lay_on
+from groundfuse.frontend.sight import cam_from_team
+
+Integers = NDArray[np.int64]
+RAY_STEP = 1e-6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PatchOptions:
+    """Options of the keypoints' alignment.
+
+    Attributes:
+        use: whether keypoints are aligned before the bundle.
+        radius_px: of a patch: it has 2 radius + 1 pixels a side.
+        blur_px: Gaussian that pictures are smoothed with.
+        steps: of a patch at most, until it rests.
+        max_move_px: farthest from where the detector saw it.
+        min_correlation: of the two patches where they rest; anything less is not the same floor.
+        least_residual: smallest deviation between two patches, of one each, that a keypoint's own
+            deviation is worked out from.
+        noise: a keypoint's deviation, as a multiple of what it would be if all of its patch were
+            one pixel; terrazzo, gravel, wood and concrete ask for 0.05 to 0.11, and the bundle
+            estimates what is left.
+        min_links: correspondences that a pair must keep; one with fewer keeps its own as they are.
+        cache_bytes: pictures held in memory at once, bytes.
+    """
+
+    use: bool = True
+    radius_px: int = 7
+    blur_px: float = 0.7
+    steps: int = 15
+    max_move_px: float = 2.0
+    min_correlation: float = 0.7
+    least_residual: float = 0.1
+    noise: float = 0.07
+    min_links: int = 12
+    cache_bytes: int = 256 * 2**20
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that make no sense (ValueError)."""
+        check_numbers(self)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PatchView:
+    """A picture and the best that is known of its place.
+
+    Attributes:
+        camera: lens and used rows.
+        attitude: of this picture.
+        team_from_foot: floor point below the camera, heading along the camera's.
+        load: reads the picture, (rows, columns, 3) BGR uint8.
+    """
+
+    camera: Camera
+    attitude: Attitude
+    team_from_foot: Se2
+    load: Callable[[], Image]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PatchPlan:
+    """Keypoints of floor points, and how the patch of each looks in its point's finest picture.
+
+    Attributes:
+        views: the pictures.
+        view: (n,) number of each keypoint's.
+        place: (n, 2) keypoints, px.
+        finest: (n,) number of the keypoint of the same point that the others are laid on.
+        by_ray: (n, 2, 2) how a keypoint moves with its ray, px.
+        map: (n, 3, 3) from pixels off a keypoint to pixels off its finest, homogeneous.
+    """
+
+    views: Sequence[PatchView]
+    view: Integers
+    place: Points
+    finest: Integers
+    by_ray: Floats
+    map: Floats
+
+
+def patch_plan(
+    views: Sequence[PatchView], view: Integers, rays: Points, point: Integers
+) -> PatchPlan:
+    """Plan the alignment of keypoints.
+
+    Args:
+        views: the pictures.
+        view: (n,) each keypoint's.
+        rays: (n, 2) of the keypoints, without distortion.
+        point: (n,) floor point of each, numbered from 0, none left out.
+    """
+    cam_from_floor = np.stack([cam_from_team(v.attitude, v.team_from_foot) for v in views])
+    place, by_ray = _through_lenses(views, view, rays)
+    floor_from_cam = np.linalg.inv(cam_from_floor)
+    on_floor = (floor_from_cam[view] @ _homogeneous(rays)[:, :, None])[:, :, 0]
+    floor = on_floor[:, :2] / on_floor[:, 2:]
+    # Pixels per square metre: a homography's area grows with its determinant over depth cubed.
+    depth = (cam_from_floor[view, 2] * _homogeneous(floor)).sum(axis=1)
+    fineness = np.abs(np.linalg.det(cam_from_floor))[view] / np.abs(depth) ** 3
+    fineness *= np.abs(np.linalg.det(by_ray))
+    order = np.lexsort((-fineness, point))
+    finest = order[np.searchsorted(point[order], np.arange(point.max() + 1))][point]
+    here = _affine(_inverse(by_ray), rays)
+    shift = _affine(np.broadcast_to(np.eye(2), by_ray.shape), floor[finest] - floor)
+    offset = -(by_ray[finest] @ rays[finest][:, :, None])[:, :, 0]
+    there = _affine(by_ray[finest], offset)
+    carried = there @ cam_from_floor[view[finest]] @ shift @ floor_from_cam[view] @ here
+    return PatchPlan(views, view, place, finest, by_ray, carried)
+
+
+def _homogeneous(points: Points) -> Floats:
+    return np.column_stack([points, np.ones(len(points))])
+
+
+def _inverse(matrices: Floats) -> Floats:
+    inverse: Floats = np.linalg.inv(matrices).astype(np.float64)
+    return inverse
+
+
+def _affine(linear: Floats, offset: Points) -> Floats:
+    """Return maps (n, 3, 3) of homogeneous points."""
+    maps = np.zeros((len(offset), 3, 3))
+    maps[:, :2, :2], maps[:, :2, 2], maps[:, 2, 2] = linear, offset, 1.0
+    return maps
+
+
+def _through_lenses(
+    views: Sequence[PatchView], view: Integers, rays: Points
+) -> tuple[Points, Floats]:
+    """Return rays' pixels (n, 2), and how they move with their rays (n, 2, 2)."""
+    lenses = [v.camera.intrinsics for v in views]
+    distinct = list(dict.fromkeys(lenses))
+    which = np.array([distinct.index(lens) for lens in lenses])[view]
+    place, by_ray = np.empty((len(rays), 2)), np.empty((len(rays), 2, 2))
+    for number, lens in enumerate(distinct):
+        mine = which == number
+        place[mine], by_ray[mine] = _through(lens, rays[mine])
+    return place, by_ray
+
+
+def _through(lens: Intrinsics, rays: Points) -> tuple[Points, Floats]:
+    place = lens.px_from_rays(rays)
+    steps = [(lens.px_from_rays(rays + RAY_STEP * unit) - place) / RAY_STEP for unit in np.eye(2)]
+    return place, np.stack(steps, axis=2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Aligned:
+    """Keypoints after their alignment.
+
+    Attributes:
+        rays: (n, 2) where they are now; nan where they do not fit.
+        sigma: (n,) one-axis standard deviation of `rays`.
+    """
+
+    rays: Points
+    sigma: Floats
+
+    @property
+    def fits(self) -> Mask:
+        """(n,) which of them fit."""
+        return np.isfinite(self.sigma)
+
+
+def grey_picture(view: PatchView, options: PatchOptions) -> Picture32:
+    """Load a view's picture, grey and smooth."""
+    grey = cv2.cvtColor(view.load(), cv2.COLOR_BGR2GRAY).astype(np.float32)
+    return np.asarray(cv2.GaussianBlur(grey, (0, 0), options.blur_px), dtype=np.float32)
+
+
+def aligned(
+    plan: PatchPlan,
+    which: Integers,
+    rays: Points,
+    picture: Callable[[int], Picture32],
+    options: PatchOptions,
+) -> Aligned:
+    """Align keypoints of one view to their finest.
+
+    Args:
+        plan: see there.
+        which: (m,) numbers of the keypoints: all of the same view, none of them a finest.
+        rays: (m, 2) of the keypoints.
+        picture: returns a view's, by its number.
+        options: see there.
+    """
+    side = 2 * options.radius_px + 1
+    number = int(plan.view[which[0]])
+    templates = np.zeros((len(which), side + 2, side + 2), np.float32)
+    finest, maps = plan.finest[which], plan.map[which]
+    place, seen_from = plan.place[finest], plan.view[finest]
+    for other in np.unique(seen_from).tolist():
+        rows = plan.views[other].camera.used_rows
+        some = np.flatnonzero(seen_from == other)
+        fill_templates(picture(other), rows, some, place, maps, templates)
+    begin, found = plan.place[which], np.empty((len(which), 4))
+    rows = plan.views[number].camera.used_rows
+    most = options.steps, options.max_move_px
+    lay_on(picture(number), rows, begin, templates, _weight(side), most, found)
+    return _judged(found, begin, _inverse(plan.by_ray[which]), rays, options)
+
+
+def _weight(side: int) -> Floats:
+    """Return weights (side, side) of sum one that fall off towards the border."""
+    line = np.exp(-0.5 * (np.linspace(-1.5, 1.5, side)) ** 2)
+    weight: Floats = np.outer(line, line) / line.sum() ** 2
+    return weight
+
+
+def _judged(
+    found: Floats, begin: Points, ray_by_px: Floats, rays: Points, options: PatchOptions
+) -> Aligned:
+    """Turn places into rays with their deviation; the lens is linear over so short a way."""
+    moved = (ray_by_px @ (found[:, :2] - begin)[:, :, None])[:, :, 0]
+    # Standardised patches: their squared difference is what their correlation lacks, twice.
+    residual = np.sqrt(np.maximum(2.0 * (1.0 - found[:, 2]), options.least_residual**2))
+    sigma_px = options.noise * residual * found[:, 3]
+    sigma = sigma_px * np.sqrt(np.abs(np.linalg.det(ray_by_px)))
+    fits = found[:, 2] >= options.min_correlation
+    return Aligned(np.where(fits[:, None], rays + moved, np.nan), np.where(fits, sigma, np.nan))

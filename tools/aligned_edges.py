@@ -1,0 +1,253 @@
+"""The bundle's correspondences, laid on each other patch by patch; what is known is kept.
+
+The bundle joins keypoints of many pairs into floor points. Here each of those is aligned in all
+its pictures at once, so that a keypoint of several pairs stays one keypoint.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from groundfuse.backend.bundle import LEAST_SIGHTINGS
+from groundfuse.backend.bundle_sample import sampled
+from groundfuse.backend.bundle_tracks import (
+    Links,
+    Sightings,
+    mixed_keys,
+    sightings_from_edges,
+    tracks,
+)
+from groundfuse.backend.measurement import (
+    Array,
+    Correspondences,
+    FrameId,
+    RelativePose,
+    TeamEstimate,
+)
+from groundfuse.frontend.arrays import Image, Picture32
+from groundfuse.frontend.patches import (
+    Aligned,
+    Integers,
+    PatchOptions,
+    PatchPlan,
+    PatchView,
+    aligned,
+    grey_picture,
+    patch_plan,
+)
+from groundfuse.frontend.picture_cache import Cache
+from groundfuse.tools.code_version import code_of
+from groundfuse.tools.packing import digest_of, key_of, packed
+from groundfuse.tools.robot import Frame, Robot
+from groundfuse.tools.store import Store
+from groundfuse.tools.team_folder import load_image
+from groundfuse.tools.workers import Progress, in_threads
+
+Keys = np.ndarray[tuple[int], np.dtype[np.uint64]]
+KIND = "patches"
+OTHER = np.uint64(0x9E3779B97F4A7C15)
+"""Odd: makes what a keypoint is laid on count otherwise than the keypoint itself."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownAlignments:
+    """Alignments that were made already.
+
+    Attributes:
+        keys: (n,) ascending: of two keypoints, their pictures and cameras, options and code.
+        found: (n, 3) ray of the first laid on the second, and its deviation; nan: it does not fit.
+    """
+
+    keys: Keys
+    found: Array
+
+
+NOTHING_KNOWN = KnownAlignments(np.zeros(0, np.uint64), np.zeros((0, 3)))
+
+
+@dataclass(frozen=True, slots=True)
+class Desk:
+    """What the alignment works with.
+
+    Attributes:
+        pictures: digest of every frame's picture.
+        store: has the alignments of the last team, and takes these.
+        num_threads: of this process.
+        progress: shows how far it is.
+        most_sightings: of all frames together, as the bundle takes part of a large team's.
+    """
+
+    pictures: Mapping[FrameId, bytes]
+    store: Store
+    num_threads: int
+    progress: Progress
+    most_sightings: int
+
+
+def aligned_edges(
+    robots: Sequence[Robot],
+    placed: Sequence[Robot],
+    team: TeamEstimate,
+    edges: Sequence[RelativePose],
+    options: PatchOptions,
+    desk: Desk,
+) -> tuple[RelativePose, ...]:
+    """Return the edges with aligned correspondences.
+
+    Keypoints whose patches do not fit are left out; an edge that would keep fewer than
+    `min_links` of its correspondences stays as it is. What was aligned for this team before is
+    not aligned again, though its places may be better known by now: where a patch rests depends
+    on where its picture was taken by less than a thousandth of a pixel a millimetre.
+
+    Args:
+        robots: with the lenses that the edges' rays are of.
+        placed: the robots with the best known attitudes.
+        team: the frames' places.
+        edges: accepted ones.
+        options: see there.
+        desk: see there.
+
+    Raises:
+        DataError: a picture can't be read.
+    """
+    frames = sorted(team.team_from_base)
+    sightings, links = sightings_from_edges(edges, {f: k for k, f in enumerate(frames)})
+    if not options.use or len(links) == 0:
+        return tuple(edges)
+    most = max(desk.most_sightings // len(frames), LEAST_SIGHTINGS)
+    used, point = sampled(*tracks(links, sightings), sightings, most)
+    if len(used) == 0:
+        return tuple(edges)
+    rays = sightings.ray[used]
+    plan = patch_plan(_views(robots, placed, team, frames), sightings.frame[used], rays, point)
+    keys = _keys(_digests(robots, frames, options, desk), plan, rays)
+    found = _known(keys, plan, desk.store.latest(KIND) or NOTHING_KNOWN)
+    if _align(plan, rays, found, options, desk):
+        others = plan.finest != np.arange(len(used))
+        known = KnownAlignments(*_sorted(keys[others], found[others, :3]))
+        desk.store.save(key_of(KIND, known.keys), KIND, "team", packed(known))
+    exact = _with_finest(plan, rays, found)
+    return _replaced(edges, sightings, links, used, exact, options.min_links)
+
+
+def _views(
+    robots: Sequence[Robot],
+    placed: Sequence[Robot],
+    team: TeamEstimate,
+    frames: Sequence[FrameId],
+) -> list[PatchView]:
+    of = {
+        frame.id: (robot, frame, best.attitude)
+        for robot, there in zip(robots, placed, strict=True)
+        for frame, best in zip(robot.frames, there.frames, strict=True)
+    }
+
+    def view(name: FrameId) -> PatchView:
+        robot, frame, attitude = of[name]
+        foot = team.team_from_base[name] @ robot.camera.mount.base_from_foot
+        return PatchView(robot.camera, attitude, foot, lambda: _picture(frame, robot))
+
+    return [view(name) for name in frames]
+
+
+def _picture(frame: Frame, robot: Robot) -> Image:
+    return load_image(frame, robot.camera)
+
+
+def _digests(
+    robots: Sequence[Robot], frames: Sequence[FrameId], options: PatchOptions, desk: Desk
+) -> Integers:
+    """Return a number for each frame: of its picture, its camera, the options and the code."""
+    code = code_of("groundfuse.tools.aligned_edges", rooms=("frontend", "tools"))
+    how = {robot.name: key_of("patches", code, options, robot.camera) for robot in robots}
+    both = [digest_of(how[frame.robot] + desk.pictures[frame]) for frame in frames]
+    return np.array([int.from_bytes(digest[:7], "little") for digest in both], np.int64)
+
+
+def _keys(digests: Integers, plan: PatchPlan, rays: Array) -> Keys:
+    """Return what stands for each keypoint and its finest, in their pictures."""
+    own = mixed_keys(digests[plan.view], rays)
+    keys: Keys = own ^ (own[plan.finest] * OTHER)
+    return keys
+
+
+def _known(keys: Keys, plan: PatchPlan, known: KnownAlignments) -> Array:
+    """Return (n, 4): what is known of each alignment, and whether it is."""
+    found = np.full((len(keys), 4), np.nan)
+    found[:, 3] = 0.0
+    if len(known.keys):
+        place = np.minimum(np.searchsorted(known.keys, keys), len(known.keys) - 1)
+        same = known.keys[place] == keys
+        found[same, :3], found[same, 3] = known.found[place[same]], 1.0
+    found[plan.finest == np.arange(len(keys)), 3] = 1.0
+    return found
+
+
+def _align(plan: PatchPlan, rays: Array, found: Array, options: PatchOptions, desk: Desk) -> bool:
+    """Align what is not known yet, view by view, and write it down; False where all is known."""
+    left = np.flatnonzero(found[:, 3] == 0.0)
+    if not len(left):
+        return False
+    by_view = left[np.argsort(plan.view[left], kind="stable")]
+    ends = np.flatnonzero(np.diff(plan.view[by_view])) + 1
+    pictures: Cache[Picture32] = Cache(
+        lambda number: grey_picture(plan.views[number], options), options.cache_bytes
+    )
+
+    def work(which: Integers) -> tuple[Integers, Aligned]:
+        return which, aligned(plan, which, rays[which], pictures.get, options)
+
+    jobs = np.split(by_view, ends)
+    done = in_threads(work, jobs, desk.num_threads)
+    for which, exact in desk.progress(done, len(jobs), "keypoints"):
+        found[which, :2], found[which, 2] = exact.rays, exact.sigma
+    return True
+
+
+def _sorted(keys: Keys, found: Array) -> tuple[Keys, Array]:
+    order = np.argsort(keys, kind="stable")
+    return keys[order], found[order]
+
+
+def _with_finest(plan: PatchPlan, rays: Array, found: Array) -> Aligned:
+    """Let the finest stay where they are, if another fits; they are as exact as those on average.
+
+    Laid on a patch with an error of its own, the others share that error, which is as if all
+    pictures, the finest too, had errors of their own.
+    """
+    own = np.arange(len(rays))
+    fits = np.isfinite(found[:, 2]) & (plan.finest != own)
+    followers = np.bincount(plan.finest[fits], minlength=len(rays))
+    total = np.bincount(plan.finest[fits], found[fits, 2], minlength=len(rays))
+    exact, sigma = (
+        np.where(fits[:, None], found[:, :2], np.nan),
+        np.where(fits, found[:, 2], np.nan),
+    )
+    followed = followers > 0
+    exact[followed], sigma[followed] = rays[followed], (total / np.maximum(followers, 1))[followed]
+    return Aligned(exact, sigma)
+
+
+def _replaced(
+    edges: Sequence[RelativePose],
+    sightings: Sightings,
+    links: Links,
+    used: Integers,
+    exact: Aligned,
+    min_links: int,
+) -> tuple[RelativePose, ...]:
+    """Return the edges with the keypoints that fit, where those are enough."""
+    rays, sigma = np.full((len(sightings), 2), np.nan), np.full(len(sightings), np.nan)
+    rays[used], sigma[used] = exact.rays, exact.sigma
+    fits = np.isfinite(sigma)
+    kept = links.only(fits[links.a] & fits[links.b])
+    ends = np.searchsorted(kept.edge, np.arange(len(edges) + 1))
+    replaced = []
+    for edge, first, stop in zip(edges, ends[:-1], ends[1:], strict=True):
+        if stop - first >= min_links:
+            a, b = kept.a[first:stop], kept.b[first:stop]
+            points = Correspondences(rays[a], rays[b], sigma[a], sigma[b])
+            edge = replace(edge, correspondences=points)  # noqa: PLW2901
+        replaced.append(edge)
+    return tuple(replaced)
