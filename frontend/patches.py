@@ -3,11 +3,13 @@
 A detector places a keypoint to a third of a pixel, and differently under each view. What a
 small patch around it looks like says more: least squares matching (Foerstner 1982, Gruen 1985)
 moves the keypoint, in every picture but one, to where the patch looks as it does in that one, the
-finest. In between lies the homography of the floor, with each lens linear over the patch.
+finest. In between lies the homography of the floor, with each lens linear over the patch; what a
+lens bends within the patch would shift it, and is taken off on average.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -21,7 +23,8 @@ from groundfuse.frontend.patches_compiled import fill_templates, lay_on
 from groundfuse.frontend.sight import cam_from_team
 
 Integers = NDArray[np.int64]
-RAY_STEP = 1e-6
+SPREAD = 0.5
+"""Deviation of the places of a patch, weighted as they are, in radii."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,7 +89,7 @@ class PatchPlan:
         view: (n,) number of each keypoint's.
         place: (n, 2) keypoints, px.
         finest: (n,) number of the keypoint of the same point that the others are laid on.
-        by_ray: (n, 2, 2) how a keypoint moves with its ray, px.
+        ray_by_px: (n, 2, 2) how a keypoint's ray moves with it.
         map: (n, 3, 3) from pixels off a keypoint to pixels off its finest, homogeneous.
     """
 
@@ -94,12 +97,16 @@ class PatchPlan:
     view: Integers
     place: Points
     finest: Integers
-    by_ray: Floats
+    ray_by_px: Floats
     map: Floats
 
 
 def patch_plan(
-    views: Sequence[PatchView], view: Integers, rays: Points, point: Integers
+    views: Sequence[PatchView],
+    view: Integers,
+    rays: Points,
+    point: Integers,
+    options: PatchOptions,
 ) -> PatchPlan:
     """Plan the alignment of keypoints.
 
@@ -108,24 +115,28 @@ def patch_plan(
         view: (n,) each keypoint's.
         rays: (n, 2) of the keypoints, without distortion.
         point: (n,) floor point of each, numbered from 0, none left out.
+        options: see there.
     """
     cam_from_floor = np.stack([cam_from_team(v.attitude, v.team_from_foot) for v in views])
-    place, by_ray = _through_lenses(views, view, rays)
     floor_from_cam = np.linalg.inv(cam_from_floor)
+    spread_px = np.full(len(view), SPREAD * options.radius_px)
+    lens = _through_lenses(views, view, rays, spread_px)
     on_floor = (floor_from_cam[view] @ _homogeneous(rays)[:, :, None])[:, :, 0]
     floor = on_floor[:, :2] / on_floor[:, 2:]
     # Pixels per square metre: a homography's area grows with its determinant over depth cubed.
     depth = (cam_from_floor[view, 2] * _homogeneous(floor)).sum(axis=1)
     fineness = np.abs(np.linalg.det(cam_from_floor))[view] / np.abs(depth) ** 3
-    fineness *= np.abs(np.linalg.det(by_ray))
+    fineness *= np.abs(np.linalg.det(lens.by_ray))
     order = np.lexsort((-fineness, point))
     finest = order[np.searchsorted(point[order], np.arange(point.max() + 1))][point]
-    here = _affine(_inverse(by_ray), rays)
-    shift = _affine(np.broadcast_to(np.eye(2), by_ray.shape), floor[finest] - floor)
-    offset = -(by_ray[finest] @ rays[finest][:, :, None])[:, :, 0]
-    there = _affine(by_ray[finest], offset)
+    larger_px = spread_px * np.sqrt(fineness[finest] / fineness)
+    other = _through_lenses(views, view[finest], rays[finest], larger_px)
+    ray_by_px = _inverse(lens.by_ray)
+    here = _affine(ray_by_px, rays - _times(ray_by_px, lens.bend))
+    shift = _affine(np.broadcast_to(np.eye(2), ray_by_px.shape), floor[finest] - floor)
+    there = _affine(other.by_ray, other.bend - _times(other.by_ray, rays[finest]))
     carried = there @ cam_from_floor[view[finest]] @ shift @ floor_from_cam[view] @ here
-    return PatchPlan(views, view, place, finest, by_ray, carried)
+    return PatchPlan(views, view, lens.place, finest, ray_by_px, carried)
 
 
 def _homogeneous(points: Points) -> Floats:
@@ -137,6 +148,12 @@ def _inverse(matrices: Floats) -> Floats:
     return inverse
 
 
+def _times(matrices: Floats, vectors: Floats) -> Floats:
+    """Multiply matrices (n, 2, 2) by vectors (n, 2)."""
+    product: Floats = (matrices @ vectors[:, :, None])[:, :, 0]
+    return product
+
+
 def _affine(linear: Floats, offset: Points) -> Floats:
     """Return maps (n, 3, 3) of homogeneous points."""
     maps = np.zeros((len(offset), 3, 3))
@@ -144,24 +161,44 @@ def _affine(linear: Floats, offset: Points) -> Floats:
     return maps
 
 
+class _Lens(NamedTuple):
+    """What a lens does to rays and to what is around them, as near as a linear map comes.
+
+    Attributes:
+        place: (n, 2) pixels of the rays.
+        by_ray: (n, 2, 2) how they move with their rays.
+        bend: (n, 2) mean of what is left, px.
+    """
+
+    place: Points
+    by_ray: Floats
+    bend: Points
+
+
 def _through_lenses(
-    views: Sequence[PatchView], view: Integers, rays: Points
-) -> tuple[Points, Floats]:
-    """Return rays' pixels (n, 2), and how they move with their rays (n, 2, 2)."""
+    views: Sequence[PatchView], view: Integers, rays: Points, spread_px: Floats
+) -> _Lens:
+    """Send rays (n, 2), each with a patch of such a deviation (n,) around it, through lenses."""
     lenses = [v.camera.intrinsics for v in views]
     distinct = list(dict.fromkeys(lenses))
     which = np.array([distinct.index(lens) for lens in lenses])[view]
-    place, by_ray = np.empty((len(rays), 2)), np.empty((len(rays), 2, 2))
+    found = _Lens(np.empty(rays.shape), np.empty((*rays.shape, 2)), np.empty(rays.shape))
     for number, lens in enumerate(distinct):
         mine = which == number
-        place[mine], by_ray[mine] = _through(lens, rays[mine])
-    return place, by_ray
+        for whole, part in zip(found, _through(lens, rays[mine], spread_px[mine]), strict=True):
+            whole[mine] = part
+    return found
 
 
-def _through(lens: Intrinsics, rays: Points) -> tuple[Points, Floats]:
-    place = lens.px_from_rays(rays)
-    steps = [(lens.px_from_rays(rays + RAY_STEP * unit) - place) / RAY_STEP for unit in np.eye(2)]
-    return place, np.stack(steps, axis=2)
+def _through(lens: Intrinsics, rays: Points, spread_px: Floats) -> _Lens:
+    place, step = lens.px_from_rays(rays), (spread_px / lens.focal_px)[:, None]
+    ends = [
+        [lens.px_from_rays(rays + sign * step * unit) - place for sign in (1.0, -1.0)]
+        for unit in np.eye(2)
+    ]
+    by_ray = np.stack([(ahead - behind) / (2.0 * step) for ahead, behind in ends], axis=2)
+    bend = sum(((ahead + behind) / 2.0 for ahead, behind in ends), np.zeros(rays.shape))
+    return _Lens(place, by_ray, bend)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -217,7 +254,7 @@ def aligned(
     rows = plan.views[number].camera.used_rows
     most = options.steps, options.max_move_px
     lay_on(picture(number), rows, begin, templates, _weight(side), most, found)
-    return _judged(found, begin, _inverse(plan.by_ray[which]), rays, options)
+    return _judged(found, begin, plan.ray_by_px[which], rays, options)
 
 
 def _weight(side: int) -> Floats:
@@ -231,7 +268,7 @@ def _judged(
     found: Floats, begin: Points, ray_by_px: Floats, rays: Points, options: PatchOptions
 ) -> Aligned:
     """Turn places into rays with their deviation; the lens is linear over so short a way."""
-    moved = (ray_by_px @ (found[:, :2] - begin)[:, :, None])[:, :, 0]
+    moved = _times(ray_by_px, found[:, :2] - begin)
     # Standardised patches: their squared difference is what their correlation lacks, twice.
     residual = np.sqrt(np.maximum(2.0 * (1.0 - found[:, 2]), options.least_residual**2))
     sigma_px = options.noise * residual * found[:, 3]

@@ -69,6 +69,17 @@ def test_a_stopwatch_adds_and_keeps_the_order(monkeypatch):
     assert list(watch.seconds.items()) == [("one", 5.0), ("two", 2.0)]
 
 
+def test_a_stage_within_another_counts_for_itself_only(monkeypatch):
+    ticks = iter([0.0, 1.0, 4.0, 5.0, 6.0, 10.0])
+    monkeypatch.setattr(pipeline.time, "perf_counter", lambda: next(ticks))
+    watch = Stopwatch()
+    with watch.stage("outer"):
+        for name in ("inner", "other"):
+            with watch.stage(name):
+                pass
+    assert watch.seconds == {"inner": 3.0, "other": 1.0, "outer": 6.0}
+
+
 def test_a_stage_that_fails_is_timed_too():
     watch = Stopwatch()
     with pytest.raises(ValueError, match="no"), watch.stage("bad"):
@@ -165,7 +176,7 @@ def test_frames_know_their_robots_and_floors_that_repeat(truth):
 
 def test_two_painted_robots_become_one_map(painted):
     fused, watch = painted
-    assert list(watch.seconds) == ["features", "retrieval", "pairs", "graphs", "bundle"]
+    assert list(watch.seconds) == ["features", "retrieval", "pairs", "graphs", "patches", "bundle"]
     assert isinstance(fused.bundled, BundleEstimate)
     frames = {FrameId(n, k) for n, m in PAIR.items() for k in range(len(m.poses))}
     assert set(fused.best.team_from_base) == set(fused.front_end.repetition) == frames

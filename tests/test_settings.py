@@ -124,7 +124,7 @@ def test_the_record_is_json_with_every_option_by_its_name():
         for part in name.split("."):
             value = value[part]
         assert value == json.loads(json.dumps(found(RunOptions(), name)))
-    assert set(content) == {"front_end", "team", "bundle", "more_looks", "mosaic"}
+    assert set(content) == {"front_end", "team", "patches", "bundle", "more_looks", "mosaic"}
 
 
 def test_option_names_are_in_the_records_order():

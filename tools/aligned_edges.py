@@ -120,7 +120,8 @@ def aligned_edges(
     if len(used) == 0:
         return tuple(edges)
     rays = sightings.ray[used]
-    plan = patch_plan(_views(robots, placed, team, frames), sightings.frame[used], rays, point)
+    views = _views(robots, placed, team, frames)
+    plan = patch_plan(views, sightings.frame[used], rays, point, options)
     keys = _keys(_digests(robots, frames, options, desk), plan, rays)
     found = _known(keys, plan, desk.store.latest(KIND) or NOTHING_KNOWN)
     if _align(plan, rays, found, options, desk):

@@ -1,0 +1,263 @@
+"""Patches laid on each other, on a floor that is a formula: every keypoint's truth is known."""
+
+import math
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from analytic_floor import floor_of_pixels, make_camera, picture, rounded, waves
+
+from groundfuse.backend.measurement import Attitude, Se2
+from groundfuse.frontend.overhead import floor_from_rays, rays_from_floor
+from groundfuse.frontend.patches import (
+    PatchOptions,
+    PatchView,
+    _weight,
+    aligned,
+    grey_picture,
+    patch_plan,
+)
+from groundfuse.frontend.patches_compiled import read_between
+
+BARREL = (-0.15, 0.04, 1e-3, -1e-3)
+OPTIONS = PatchOptions()
+POSES = (Se2(0.0, 0.0, 0.0), Se2(0.06, 0.03, 0.4), Se2(-0.05, 0.04, -0.7))
+WAVE_M = 0.045
+# Wobble that is not told, interpolation, rounding to whole levels: nine in ten keypoints end
+# within 0.032 px, half of them within 0.015.
+EXACT_PX = 0.04
+
+
+def attitude_of(number):
+    """The wobble of the pictures, which the alignment is not told of."""
+    tilt, roll, height = np.random.default_rng(number).standard_normal(3).tolist()
+    expected = make_camera().mount.attitude
+    return Attitude(
+        expected.tilt_rad + math.radians(0.5 * tilt),
+        math.radians(0.15 * roll),
+        expected.height_m + 0.002 * height,
+    )
+
+
+def colour(points):
+    # Three grains: one alone repeats itself, and a wrong peak fits as well as the right one.
+    grains = (1.0, 1.7, 0.6)
+    return sum(waves(points, grain * WAVE_M) for grain in grains) / len(grains)
+
+
+def as_it_is(_, image):
+    return image
+
+
+class World:
+    """Pictures of floor points, with their true pixels and rays."""
+
+    def __init__(self, coefficients=(), change=as_it_is, count=60):
+        self.camera = make_camera(coefficients=coefficients, size=(240, 180))
+        self.attitudes = [attitude_of(k) for k in range(len(POSES))]
+        images = [
+            rounded(change(k, picture(self.camera, attitude, pose, colour)))
+            for k, (attitude, pose) in enumerate(zip(self.attitudes, POSES, strict=True))
+        ]
+        known = self.camera.mount.attitude
+        self.views = [
+            PatchView(self.camera, known, pose, lambda image=image: image)
+            for pose, image in zip(POSES, images, strict=True)
+        ]
+        self.pictures = [grey_picture(view, OPTIONS) for view in self.views]
+        self._place(count)
+
+    def _place(self, count):
+        lens, margin = self.camera.intrinsics, OPTIONS.radius_px + 5
+        floor = floor_of_pixels(self.camera, self.attitudes[0], POSES[0])
+        candidates = np.random.default_rng(5).permutation(floor[np.isfinite(floor[:, 0])])
+        rays = np.stack(
+            [
+                rays_from_floor(attitude, pose.inverse().apply(candidates))
+                for attitude, pose in zip(self.attitudes, POSES, strict=True)
+            ]
+        )
+        px = np.stack([lens.px_from_rays(ray) for ray in rays])
+        size = np.array([lens.width_px, lens.height_px])
+        with np.errstate(invalid="ignore"):
+            inside = ((px > margin) & (px < size - 1 - margin)).all(axis=(0, 2))
+        some = np.flatnonzero(inside)[:count]
+        assert len(some) == count
+        self.view = np.repeat(np.arange(len(POSES)), count)
+        self.point = np.tile(np.arange(count), len(POSES))
+        self.px, self.rays = px[:, some].reshape(-1, 2), rays[:, some].reshape(-1, 2)
+
+    def seen(self, spread_px, seed=1):
+        """Rays as a detector has them: all but each point's finest are off."""
+        lens = self.camera.intrinsics
+        finest = patch_plan(self.views, self.view, self.rays, self.point, OPTIONS).finest
+        off = spread_px * np.random.default_rng(seed).uniform(-1.0, 1.0, self.px.shape)
+        off[finest == np.arange(len(off))] = 0.0
+        rays = lens.rays_from_px(self.px + off)
+        rays[finest == np.arange(len(off))] = self.rays[finest == np.arange(len(off))]
+        return rays, finest
+
+    def aligned(self, rays, options=OPTIONS):
+        """Aligned keypoints: numbers, errors in pixels (nan where they don't fit), deviations."""
+        plan = patch_plan(self.views, self.view, rays, self.point, OPTIONS)
+        others = plan.finest != np.arange(len(rays))
+        lens, numbers, errors, sigmas = self.camera.intrinsics, [], [], []
+        for number in range(len(self.views)):
+            which = np.flatnonzero(others & (self.view == number))
+            if len(which):
+                exact = aligned(plan, which, rays[which], self.pictures.__getitem__, options)
+                numbers.append(which)
+                errors.append(lens.px_from_rays(exact.rays) - self.px[which])
+                sigmas.append(exact.sigma * lens.focal_px)
+        return np.concatenate(numbers), np.concatenate(errors), np.concatenate(sigmas)
+
+
+@pytest.fixture(scope="module", params=[(), BARREL], ids=["pinhole", "barrel"])
+def world(request):
+    return World(request.param)
+
+
+def test_keypoints_come_back_to_where_they_are(world):
+    rays, _ = world.seen(0.9)
+    _, errors, sigmas = world.aligned(rays)
+    assert np.isfinite(sigmas).mean() > 0.9
+    error = np.hypot(*errors[np.isfinite(sigmas)].T)
+    assert np.quantile(error, 0.9) < EXACT_PX
+    assert np.median(error) < 0.5 * EXACT_PX
+
+
+def test_an_error_of_the_finest_is_shared_by_all_that_are_laid_on_it(world):
+    """So the floor point moves, and nothing else does."""
+    rays, finest = world.seen(0.0)
+    own = finest == np.arange(len(finest))
+    lens = world.camera.intrinsics
+    rays[own] = lens.rays_from_px(world.px[own] + np.array([0.4, -0.3]))
+    numbers, errors, _ = world.aligned(rays)
+    plan = patch_plan(world.views, world.view, rays, world.point, OPTIONS)
+    # The map carries a pixel of theirs to one of the finest.
+    carried = (plan.map[numbers][:, :2, :2] @ errors[:, :, None])[:, :, 0]
+    fits = np.isfinite(carried[:, 0])
+    assert fits.mean() > 0.9
+    off = np.hypot(*(carried[fits] - np.array([0.4, -0.3])).T)
+    assert np.median(off) < 2.0 * EXACT_PX
+
+
+def test_maps_agree_with_going_by_way_of_the_floor(world):
+    """To the last bit without distortion; else on average over the patch, which is what counts."""
+    plan = patch_plan(world.views, world.view, world.rays, world.point, OPTIONS)
+    lens, known = world.camera.intrinsics, world.camera.mount.attitude
+    side = 2 * OPTIONS.radius_px + 1
+    off = np.stack(np.meshgrid(*2 * [np.arange(side) - OPTIONS.radius_px]), axis=-1).reshape(-1, 2)
+    weight = _weight(side).ravel()
+    for number in range(0, len(world.view), 7):
+        view, other = int(plan.view[number]), int(plan.finest[number])
+        there = int(plan.view[other])
+        # The attitudes told are not the true ones: where both think the point is differs.
+        spots = [
+            POSES[v].apply(floor_from_rays(known, world.rays[k][None]))
+            for v, k in ((view, number), (there, other))
+        ]
+        rays = lens.rays_from_px(plan.place[number] + off)
+        floor = POSES[view].apply(floor_from_rays(known, rays)) + spots[1] - spots[0]
+        seen = lens.px_from_rays(rays_from_floor(known, POSES[there].inverse().apply(floor)))
+        mapped = np.column_stack([off, np.ones(len(off))]) @ plan.map[number].T
+        error = plan.place[other] + mapped[:, :2] / mapped[:, 2:] - seen
+        if lens.is_pinhole:
+            assert np.abs(error).max() < 1e-6
+        else:  # worst seen 0.007 and 0.11; without the bend's mean 0.04
+            assert np.abs(weight @ error).max() < 0.012
+            assert np.abs(error).max() < 0.2
+
+
+def test_light_does_not_matter():
+    plain = World()
+    rays, _ = plain.seen(0.9)
+    dark = World(change=lambda number, image: image * (1.0, 0.6, 1.3)[number] - 10.0 * number)
+    _, errors, _ = dark.aligned(rays)
+    assert np.isfinite(errors).mean() > 0.9
+    assert np.nanquantile(np.hypot(*errors.T), 0.9) < 1.5 * EXACT_PX  # coarser levels
+
+
+def test_deviations_are_those_of_the_errors():
+    """With the noise of a camera; the bundle estimates a common factor, so a rough match does."""
+    rng = np.random.default_rng(3)
+    noisy = World(change=lambda _, image: image + rng.normal(0.0, 5.0, image.shape), count=120)
+    rays, _ = noisy.seen(0.5)
+    _, errors, sigmas = noisy.aligned(rays)
+    fits = np.isfinite(sigmas)
+    scaled = errors[fits] / sigmas[fits, None]
+    assert fits.mean() > 0.9
+    # Both pictures have noise; 1.3 to 2.0 over three seeds of noise of 3 to 12 levels.
+    assert 0.7 < 1.4826 * np.median(np.abs(scaled)) / math.sqrt(2.0) < 2.5
+
+
+def test_more_noise_makes_larger_deviations():
+    quiet, loud = (
+        World(
+            change=lambda _, image, s=s: image + np.random.default_rng(4).normal(0, s, image.shape)
+        )
+        for s in (3.0, 12.0)
+    )
+    rays, _ = quiet.seen(0.3)
+    assert np.nanmedian(loud.aligned(rays)[2]) > 1.8 * np.nanmedian(quiet.aligned(rays)[2])
+
+
+@pytest.mark.parametrize(
+    ("change", "options"),
+    [
+        (lambda n, image: image if n == 0 else np.full_like(image, 90.0), OPTIONS),
+        (lambda n, image: image if n == 0 else image[::-1, ::-1], OPTIONS),
+        (as_it_is, replace(OPTIONS, max_move_px=0.05)),
+        (as_it_is, replace(OPTIONS, steps=1)),
+        (as_it_is, replace(OPTIONS, min_correlation=1.1)),
+    ],
+    ids=["blank", "another floor", "too far", "not at rest", "not alike enough"],
+)
+def test_what_does_not_fit_is_left_out(change, options):
+    world = World(change=change)
+    rays, finest = world.seen(0.9)
+    numbers, _, sigmas = world.aligned(rays, options)
+    apart = world.view[numbers] != 0
+    apart |= world.view[finest[numbers]] != 0
+    assert np.isfinite(sigmas[apart]).mean() < 0.15
+
+
+def test_patches_that_reach_over_the_border_are_left_out():
+    world = World()
+    world.camera = replace(world.camera, first_row=60)
+    world.views = [replace(view, camera=world.camera) for view in world.views]
+    rays, finest = world.seen(0.5)
+    numbers, _, sigmas = world.aligned(rays)
+    rows, reach = world.px[:, 1], OPTIONS.radius_px
+    over = (rows[numbers] < 60 + reach - 1) | (rows[finest[numbers]] < 60 + reach - 5)
+    assert over.sum() > 5
+    assert not np.isfinite(sigmas[over]).any()
+    assert np.isfinite(sigmas).any()
+
+
+def test_the_finest_picture_is_the_one_that_is_nearest():
+    near, far = make_camera(tilt_deg=10.0, height_m=0.3), make_camera(tilt_deg=10.0, height_m=0.6)
+    views = [PatchView(c, c.mount.attitude, Se2(0.0, 0.0, 0.0), lambda: None) for c in (far, near)]
+    floor = np.array([[0.02, 0.01], [0.05, -0.03]])
+    rays = np.vstack([rays_from_floor(v.attitude, floor) for v in views])
+    plan = patch_plan(views, np.array([0, 0, 1, 1]), rays, np.array([0, 1, 0, 1]), OPTIONS)
+    assert plan.finest.tolist() == [2, 3, 2, 3]
+    assert np.allclose(plan.map[2:], np.eye(3), atol=1e-9)
+
+
+def test_reading_between_pixels_is_bilinear():
+    rng = np.random.default_rng(0)
+    image = rng.normal(100.0, 30.0, (20, 30)).astype(np.float32)
+    u, v = rng.uniform(0.0, 28.9, 50), rng.uniform(0.0, 18.9, 50)
+    # OpenCV's places are multiples of 1/32 px.
+    u, v = np.floor(u * 32) / 32, np.floor(v * 32) / 32
+    known = cv2.remap(image, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR).ravel()
+    found = [read_between(image, *place) for place in zip(u.tolist(), v.tolist(), strict=True)]
+    assert np.allclose(found, known, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["radius_px", "blur_px", "noise", "max_move_px", "cache_bytes"])
+def test_options_refuse_what_makes_no_sense(name):
+    with pytest.raises(ValueError, match=name):
+        PatchOptions(**{name: 0})
