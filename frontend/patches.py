@@ -44,7 +44,7 @@ class PatchOptions:
             one pixel; terrazzo, gravel, wood and concrete ask for 0.05 to 0.11, and the bundle
             estimates what is left.
         min_links: correspondences that a pair must keep; one with fewer keeps its own as they are.
-        cache_bytes: pictures held in memory at once, bytes.
+        cache_bytes: pictures held in memory at once, and as much for patches, bytes.
     """
 
     use: bool = True
@@ -219,17 +219,47 @@ class Aligned:
         return np.isfinite(self.sigma)
 
 
-def grey_picture(view: PatchView, options: PatchOptions) -> Picture32:
+def grey_picture(view: PatchView, options: PatchOptions) -> Image:
     """Load a view's picture, grey and smooth."""
-    grey = cv2.cvtColor(view.load(), cv2.COLOR_BGR2GRAY).astype(np.float32)
-    return np.asarray(cv2.GaussianBlur(grey, (0, 0), options.blur_px), dtype=np.float32)
+    grey = cv2.cvtColor(view.load(), cv2.COLOR_BGR2GRAY)
+    return np.asarray(cv2.GaussianBlur(grey, (0, 0), options.blur_px), dtype=np.uint8)
+
+
+def empty_templates(count: int, options: PatchOptions) -> Picture32:
+    """Return room for the patches of so many keypoints."""
+    side = 2 * options.radius_px + 3  # slopes need a border
+    return np.zeros((count, side, side), np.float32)
+
+
+def fill_from(
+    plan: PatchPlan,
+    finest: int,
+    which: Integers,
+    places: Integers,
+    picture: Image,
+    templates: Picture32,
+) -> None:
+    """Read patches from the view that their finest are in.
+
+    Args:
+        plan: see there.
+        finest: number of that view.
+        which: (m,) numbers of the keypoints: the finest of all of them are in that view.
+        places: (m,) numbers of their templates.
+        picture: that view's; see `grey_picture`.
+        templates: to fill.
+    """
+    rows = plan.views[finest].camera.used_rows
+    middle = plan.place[plan.finest[which]]
+    fill_templates(picture, rows, places, middle, plan.map[which], templates)
 
 
 def aligned(
     plan: PatchPlan,
     which: Integers,
     rays: Points,
-    picture: Callable[[int], Picture32],
+    picture: Image,
+    templates: Picture32,
     options: PatchOptions,
 ) -> Aligned:
     """Align keypoints of one view to their finest.
@@ -238,22 +268,15 @@ def aligned(
         plan: see there.
         which: (m,) numbers of the keypoints: all of the same view, none of them a finest.
         rays: (m, 2) of the keypoints.
-        picture: returns a view's, by its number.
+        picture: the view's; see `grey_picture`.
+        templates: (m, ...) of the keypoints, filled.
         options: see there.
     """
-    side = 2 * options.radius_px + 1
-    number = int(plan.view[which[0]])
-    templates = np.zeros((len(which), side + 2, side + 2), np.float32)
-    finest, maps = plan.finest[which], plan.map[which]
-    place, seen_from = plan.place[finest], plan.view[finest]
-    for other in np.unique(seen_from).tolist():
-        rows = plan.views[other].camera.used_rows
-        some = np.flatnonzero(seen_from == other)
-        fill_templates(picture(other), rows, some, place, maps, templates)
     begin, found = plan.place[which], np.empty((len(which), 4))
-    rows = plan.views[number].camera.used_rows
+    rows = plan.views[int(plan.view[which[0]])].camera.used_rows
     most = options.steps, options.max_move_px
-    lay_on(picture(number), rows, begin, templates, _weight(side), most, found)
+    weight = _weight(2 * options.radius_px + 1)
+    lay_on(picture, rows, begin, templates, weight, most, found)
     return _judged(found, begin, plan.ray_by_px[which], rays, options)
 
 

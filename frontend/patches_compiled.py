@@ -18,8 +18,9 @@ def read_between(picture: Any, u: Any, v: Any) -> Any:  # noqa: ANN401 - arrays,
     """Return the grey value (bilinear) at a place between the picture's pixels."""
     x, y = np.int64(u), np.int64(v)
     right, down = np.float32(u - x), np.float32(v - y)
-    upper = picture[y, x] + right * (picture[y, x + 1] - picture[y, x])
-    lower = picture[y + 1, x] + right * (picture[y + 1, x + 1] - picture[y + 1, x])
+    upper, lower = np.float32(picture[y, x]), np.float32(picture[y + 1, x])
+    upper += right * (np.float32(picture[y, x + 1]) - upper)
+    lower += right * (np.float32(picture[y + 1, x + 1]) - lower)
     return upper + down * (lower - upper)
 
 
@@ -35,23 +36,23 @@ def fill_templates(
     """Read patches of a picture as other pictures would show them; nan at the first pixel: none.
 
     Args:
-        picture: (rows, columns) float32 grey.
+        picture: (rows, columns) uint8 grey.
         rows: first and last row that may be read.
-        which: (m,) numbers of the patches to read.
-        places: (n, 2) middle of each in the picture.
-        maps: (n, 3, 3) homographies from pixels off the middle there to pixels off the middle here.
+        which: (m,) numbers of the templates to fill.
+        places: (m, 2) middle of each in the picture.
+        maps: (m, 3, 3) homographies from pixels off the middle there to pixels off the middle here.
         templates: (n, side, side) float32 to fill.
     """
     side = templates.shape[1]
     reach, last_u = side // 2, picture.shape[1] - 1
-    for n in which:
-        m = maps[n]
+    for k in range(len(which)):
+        n, m = which[k], maps[k]
         for i in range(side):
             for j in range(side):
                 x, y = np.float64(j - reach), np.float64(i - reach)
                 depth = m[2, 0] * x + m[2, 1] * y + m[2, 2]
-                u = places[n, 0] + (m[0, 0] * x + m[0, 1] * y + m[0, 2]) / depth
-                v = places[n, 1] + (m[1, 0] * x + m[1, 1] * y + m[1, 2]) / depth
+                u = places[k, 0] + (m[0, 0] * x + m[0, 1] * y + m[0, 2]) / depth
+                v = places[k, 1] + (m[1, 0] * x + m[1, 1] * y + m[1, 2]) / depth
                 if not (u >= 0.0 and u < last_u and v >= rows[0] and v < rows[1]):
                     templates[n, 0, 0] = np.nan
                     break
@@ -118,9 +119,10 @@ def _read_patch(picture: Any, rows: tuple[int, int], u: float, v: float, patch: 
     right, down = np.float32(u - np.int64(u)), np.float32(v - np.int64(v))
     for i in range(patch.shape[0]):
         for j in range(patch.shape[1]):
-            here, below = picture[y + i, x + j], picture[y + i + 1, x + j]
-            upper = here + right * (picture[y + i, x + j + 1] - here)
-            lower = below + right * (picture[y + i + 1, x + j + 1] - below)
+            upper = np.float32(picture[y + i, x + j])
+            lower = np.float32(picture[y + i + 1, x + j])
+            upper += right * (np.float32(picture[y + i, x + j + 1]) - upper)
+            lower += right * (np.float32(picture[y + i + 1, x + j + 1]) - lower)
             patch[i, j] = upper + down * (lower - upper)
     return True
 
@@ -193,7 +195,7 @@ def lay_on(
     """Move each template over a picture to where it fits best (Lucas and Kanade 1981).
 
     Args:
-        picture: (rows, columns) float32 grey.
+        picture: (rows, columns) uint8 grey.
         rows: first and last row that may be read.
         places: (n, 2) where to begin.
         templates: (n, side + 2, side + 2) float32, with a border of one pixel.

@@ -10,7 +10,7 @@ from painted_team import HEIGHT_M, PAIR, QUICK, SIGMA, painted_pair
 from groundfuse.backend.bundle_tracks import sightings_from_edges
 from groundfuse.backend.measurement import Attitude, FrameId, RelativePose, Se2
 from groundfuse.frontend.overhead import floor_from_rays
-from groundfuse.frontend.patches import PatchOptions
+from groundfuse.frontend.patches import PatchOptions, empty_templates
 from groundfuse.tools import aligned_edges as module
 from groundfuse.tools.aligned_edges import KIND, Desk, aligned_edges
 from groundfuse.tools.fuse_team import RunOptions
@@ -118,6 +118,12 @@ def test_a_keypoint_of_several_pairs_stays_one(fused, accepted):
 
 def test_threads_and_runs_give_the_same_bits(fused, accepted):
     assert same(run(fused, accepted, num_threads=1), run(fused, accepted, num_threads=3))
+
+
+def test_little_room_gives_the_same_bits(fused, accepted):
+    """Ten patches and no picture at a time."""
+    little = replace(OPTIONS, cache_bytes=10 * empty_templates(1, OPTIONS).nbytes)
+    assert same(run(fused, accepted[:3], little), run(fused, accepted[:3]))
 
 
 def test_the_order_of_the_pairs_does_not_matter(fused, accepted):

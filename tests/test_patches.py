@@ -15,6 +15,8 @@ from groundfuse.frontend.patches import (
     PatchView,
     _weight,
     aligned,
+    empty_templates,
+    fill_from,
     grey_picture,
     patch_plan,
 )
@@ -106,7 +108,13 @@ class World:
         for number in range(len(self.views)):
             which = np.flatnonzero(others & (self.view == number))
             if len(which):
-                exact = aligned(plan, which, rays[which], self.pictures.__getitem__, options)
+                templates = empty_templates(len(which), options)
+                for other in range(len(self.views)):
+                    some = np.flatnonzero(plan.view[plan.finest[which]] == other)
+                    picture = self.pictures[other]
+                    fill_from(plan, other, which[some], some, picture, templates)
+                picture = self.pictures[number]
+                exact = aligned(plan, which, rays[which], picture, templates, options)
                 numbers.append(which)
                 errors.append(lens.px_from_rays(exact.rays) - self.px[which])
                 sigmas.append(exact.sigma * lens.focal_px)
@@ -248,11 +256,13 @@ def test_the_finest_picture_is_the_one_that_is_nearest():
 
 def test_reading_between_pixels_is_bilinear():
     rng = np.random.default_rng(0)
-    image = rng.normal(100.0, 30.0, (20, 30)).astype(np.float32)
+    image = rng.integers(0, 256, (20, 30)).astype(np.uint8)
     u, v = rng.uniform(0.0, 28.9, 50), rng.uniform(0.0, 18.9, 50)
     # OpenCV's places are multiples of 1/32 px.
     u, v = np.floor(u * 32) / 32, np.floor(v * 32) / 32
-    known = cv2.remap(image, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR).ravel()
+    known = cv2.remap(
+        image.astype(np.float32), u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR
+    ).ravel()
     found = [read_between(image, *place) for place in zip(u.tolist(), v.tolist(), strict=True)]
     assert np.allclose(found, known, atol=1e-3)
 

@@ -4,7 +4,7 @@ The bundle joins keypoints of many pairs into floor points. Here each of those i
 its pictures at once, so that a keypoint of several pairs stays one keypoint.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,7 +25,7 @@ from groundfuse.backend.measurement import (
     RelativePose,
     TeamEstimate,
 )
-from groundfuse.frontend.arrays import Image, Picture32
+from groundfuse.frontend.arrays import Image
 from groundfuse.frontend.patches import (
     Aligned,
     Integers,
@@ -33,6 +33,8 @@ from groundfuse.frontend.patches import (
     PatchPlan,
     PatchView,
     aligned,
+    empty_templates,
+    fill_from,
     grey_picture,
     patch_plan,
 )
@@ -186,24 +188,58 @@ def _known(keys: Keys, plan: PatchPlan, known: KnownAlignments) -> Array:
 
 
 def _align(plan: PatchPlan, rays: Array, found: Array, options: PatchOptions, desk: Desk) -> bool:
-    """Align what is not known yet, view by view, and write it down; False where all is known."""
+    """Align what is not known yet and write it down; False where all is known.
+
+    The keypoints are numbered view by view. As many at a time as there is room for read their
+    patches, view by view of their finest, and are then laid on, view by view of their own: however
+    far apart two views of a place were taken, few pictures are read more than once.
+    """
     left = np.flatnonzero(found[:, 3] == 0.0)
-    if not len(left):
-        return False
-    by_view = left[np.argsort(plan.view[left], kind="stable")]
-    ends = np.flatnonzero(np.diff(plan.view[by_view])) + 1
-    pictures: Cache[Picture32] = Cache(
+    pictures: Cache[Image] = Cache(
         lambda number: grey_picture(plan.views[number], options), options.cache_bytes
     )
+    most = max(1, options.cache_bytes // empty_templates(1, options).nbytes)
+    parts = [left[first : first + most] for first in range(0, len(left), most)]
 
-    def work(which: Integers) -> tuple[Integers, Aligned]:
-        return which, aligned(plan, which, rays[which], pictures.get, options)
+    def steps() -> Iterator[None]:
+        for part in parts:
+            yield from _align_part(plan, part, rays, found, pictures.get, options, desk.num_threads)
 
-    jobs = np.split(by_view, ends)
-    done = in_threads(work, jobs, desk.num_threads)
-    for which, exact in desk.progress(done, len(jobs), "keypoints"):
+    total = sum(len(_by(n[part])) for part in parts for n in (plan.view, plan.view[plan.finest]))
+    for _ in desk.progress(steps(), total, "keypoints"):
+        pass
+    return bool(len(left))
+
+
+def _align_part(
+    plan: PatchPlan,
+    part: Integers,
+    rays: Array,
+    found: Array,
+    picture: Callable[[int], Image],
+    options: PatchOptions,
+    num_threads: int,
+) -> Iterator[None]:
+    """Align keypoints, ascending; each view that patches are read from or laid on is a step."""
+    templates, seen_best = empty_templates(len(part), options), plan.view[plan.finest[part]]
+
+    def fill(places: Integers) -> None:
+        view = int(seen_best[places[0]])
+        fill_from(plan, view, part[places], places, picture(view), templates)
+
+    def lay(places: Integers) -> None:
+        which, view = part[places], int(plan.view[part[places[0]]])
+        exact = aligned(plan, which, rays[which], picture(view), templates[places], options)
         found[which, :2], found[which, 2] = exact.rays, exact.sigma
-    return True
+
+    yield from in_threads(fill, _by(seen_best), num_threads)
+    yield from in_threads(lay, _by(plan.view[part]), num_threads)
+
+
+def _by(number: Integers) -> list[Integers]:
+    """Return the places of each number that occurs, in the order of the numbers."""
+    order = np.argsort(number, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(number[order])) + 1)
 
 
 def _sorted(keys: Keys, found: Array) -> tuple[Keys, Array]:
