@@ -81,62 +81,102 @@ class PatchView:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PatchPlan:
-    """Keypoints of floor points, and how the patch of each looks in its point's finest picture.
+class Keypoints:
+    """Keypoints of floor points.
 
     Attributes:
-        views: the pictures.
-        view: (n,) number of each keypoint's.
-        place: (n, 2) keypoints, px.
+        view: (n,) number of each one's view.
+        rays: (n, 2) without distortion.
+        floor: (n, 2) where they are on the floor, as far as is known, m.
+        fineness: (n,) pixels per area of the floor, to compare.
         finest: (n,) number of the keypoint of the same point that the others are laid on.
-        ray_by_px: (n, 2, 2) how a keypoint's ray moves with it.
-        map: (n, 3, 3) from pixels off a keypoint to pixels off its finest, homogeneous.
     """
 
-    views: Sequence[PatchView]
     view: Integers
-    place: Points
+    rays: Points
+    floor: Points
+    fineness: Floats
     finest: Integers
-    ray_by_px: Floats
-    map: Floats
 
 
-def patch_plan(
-    views: Sequence[PatchView],
-    view: Integers,
-    rays: Points,
-    point: Integers,
-    options: PatchOptions,
-) -> PatchPlan:
-    """Plan the alignment of keypoints.
+def keypoints_of(
+    views: Sequence[PatchView], view: Integers, rays: Points, point: Integers
+) -> Keypoints:
+    """Find each floor point's finest keypoint.
 
     Args:
         views: the pictures.
         view: (n,) each keypoint's.
         rays: (n, 2) of the keypoints, without distortion.
         point: (n,) floor point of each, numbered from 0, none left out.
-        options: see there.
     """
-    cam_from_floor = np.stack([cam_from_team(v.attitude, v.team_from_foot) for v in views])
-    floor_from_cam = np.linalg.inv(cam_from_floor)
-    spread_px = np.full(len(view), SPREAD * options.radius_px)
-    lens = _through_lenses(views, view, rays, spread_px)
-    on_floor = (floor_from_cam[view] @ _homogeneous(rays)[:, :, None])[:, :, 0]
+    cam_from_floor = _cams_from_floor(views)
+    on_floor = (np.linalg.inv(cam_from_floor)[view] @ _homogeneous(rays)[:, :, None])[:, :, 0]
     floor = on_floor[:, :2] / on_floor[:, 2:]
-    # Pixels per square metre: a homography's area grows with its determinant over depth cubed.
+    # A homography's area grows with its determinant over depth cubed; the lens adds its own.
     depth = (cam_from_floor[view, 2] * _homogeneous(floor)).sum(axis=1)
     fineness = np.abs(np.linalg.det(cam_from_floor))[view] / np.abs(depth) ** 3
+    lens = _through_lenses(views, view, rays, np.ones(len(rays)))
     fineness *= np.abs(np.linalg.det(lens.by_ray))
     order = np.lexsort((-fineness, point))
     finest = order[np.searchsorted(point[order], np.arange(point.max() + 1))][point]
-    larger_px = spread_px * np.sqrt(fineness[finest] / fineness)
-    other = _through_lenses(views, view[finest], rays[finest], larger_px)
+    return Keypoints(view, rays, floor, fineness, finest)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PatchPlan:
+    """How the patches of keypoints look in their points' finest pictures.
+
+    Attributes:
+        views: the pictures.
+        view: (m,) number of each keypoint's.
+        rays: (m, 2) of the keypoints.
+        place: (m, 2) the keypoints, px.
+        ray_by_px: (m, 2, 2) how a keypoint's ray moves with it.
+        finest_view: (m,) number of the finest's view.
+        finest_place: (m, 2) the finest, px.
+        map: (m, 3, 3) from pixels off a keypoint to pixels off its finest, homogeneous.
+    """
+
+    views: Sequence[PatchView]
+    view: Integers
+    rays: Points
+    place: Points
+    ray_by_px: Floats
+    finest_view: Integers
+    finest_place: Points
+    map: Floats
+
+
+def patch_plan(
+    views: Sequence[PatchView], known: Keypoints, which: Integers, options: PatchOptions
+) -> PatchPlan:
+    """Plan the alignment of some keypoints.
+
+    Args:
+        views: the pictures.
+        known: all keypoints.
+        which: (m,) numbers of those that are to be aligned.
+        options: see there.
+    """
+    cam_from_floor, finest = _cams_from_floor(views), known.finest[which]
+    view, rays, there = known.view[which], known.rays[which], known.view[finest]
+    spread_px = np.full(len(which), SPREAD * options.radius_px)
+    lens = _through_lenses(views, view, rays, spread_px)
+    larger_px = spread_px * np.sqrt(known.fineness[finest] / known.fineness[which])
+    other = _through_lenses(views, there, known.rays[finest], larger_px)
     ray_by_px = _inverse(lens.by_ray)
-    here = _affine(ray_by_px, rays - _times(ray_by_px, lens.bend))
-    shift = _affine(np.broadcast_to(np.eye(2), ray_by_px.shape), floor[finest] - floor)
-    there = _affine(other.by_ray, other.bend - _times(other.by_ray, rays[finest]))
-    carried = there @ cam_from_floor[view[finest]] @ shift @ floor_from_cam[view] @ here
-    return PatchPlan(views, view, lens.place, finest, ray_by_px, carried)
+    from_px = _affine(ray_by_px, rays - _times(ray_by_px, lens.bend))
+    eye = np.broadcast_to(np.eye(2), ray_by_px.shape)
+    shift = _affine(eye, known.floor[finest] - known.floor[which])
+    to_px = _affine(other.by_ray, other.bend - _times(other.by_ray, known.rays[finest]))
+    floor_from_cam = np.linalg.inv(cam_from_floor)
+    carried = to_px @ cam_from_floor[there] @ shift @ floor_from_cam[view] @ from_px
+    return PatchPlan(views, view, rays, lens.place, ray_by_px, there, other.place, carried)
+
+
+def _cams_from_floor(views: Sequence[PatchView]) -> Floats:
+    return np.stack([cam_from_team(v.attitude, v.team_from_foot) for v in views])
 
 
 def _homogeneous(points: Points) -> Floats:
@@ -231,53 +271,37 @@ def empty_templates(count: int, options: PatchOptions) -> Picture32:
     return np.zeros((count, side, side), np.float32)
 
 
-def fill_from(
-    plan: PatchPlan,
-    finest: int,
-    which: Integers,
-    places: Integers,
-    picture: Image,
-    templates: Picture32,
-) -> None:
+def fill_from(plan: PatchPlan, which: Integers, picture: Image, templates: Picture32) -> None:
     """Read patches from the view that their finest are in.
 
     Args:
         plan: see there.
-        finest: number of that view.
-        which: (m,) numbers of the keypoints: the finest of all of them are in that view.
-        places: (m,) numbers of their templates.
+        which: (k,) numbers of the plan's keypoints: the finest of all of them are in one view.
         picture: that view's; see `grey_picture`.
-        templates: to fill.
+        templates: (m, ...) of the plan's keypoints, to fill.
     """
-    rows = plan.views[finest].camera.used_rows
-    middle = plan.place[plan.finest[which]]
-    fill_templates(picture, rows, places, middle, plan.map[which], templates)
+    rows = plan.views[int(plan.finest_view[which[0]])].camera.used_rows
+    fill_templates(picture, rows, which, plan.finest_place[which], plan.map[which], templates)
 
 
 def aligned(
-    plan: PatchPlan,
-    which: Integers,
-    rays: Points,
-    picture: Image,
-    templates: Picture32,
-    options: PatchOptions,
+    plan: PatchPlan, which: Integers, picture: Image, templates: Picture32, options: PatchOptions
 ) -> Aligned:
     """Align keypoints of one view to their finest.
 
     Args:
         plan: see there.
-        which: (m,) numbers of the keypoints: all of the same view, none of them a finest.
-        rays: (m, 2) of the keypoints.
+        which: (k,) numbers of the plan's keypoints: all of one view.
         picture: the view's; see `grey_picture`.
-        templates: (m, ...) of the keypoints, filled.
+        templates: (m, ...) of the plan's keypoints, filled.
         options: see there.
     """
     begin, found = plan.place[which], np.empty((len(which), 4))
     rows = plan.views[int(plan.view[which[0]])].camera.used_rows
     most = options.steps, options.max_move_px
     weight = _weight(2 * options.radius_px + 1)
-    lay_on(picture, rows, begin, templates, weight, most, found)
-    return _judged(found, begin, plan.ray_by_px[which], rays, options)
+    lay_on(picture, rows, begin, templates[which], weight, most, found)
+    return _judged(found, begin, plan.ray_by_px[which], plan.rays[which], options)
 
 
 def _weight(side: int) -> Floats:

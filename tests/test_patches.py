@@ -18,6 +18,7 @@ from groundfuse.frontend.patches import (
     empty_templates,
     fill_from,
     grey_picture,
+    keypoints_of,
     patch_plan,
 )
 from groundfuse.frontend.patches_compiled import read_between
@@ -93,32 +94,33 @@ class World:
     def seen(self, spread_px, seed=1):
         """Rays as a detector has them: all but each point's finest are off."""
         lens = self.camera.intrinsics
-        finest = patch_plan(self.views, self.view, self.rays, self.point, OPTIONS).finest
+        finest = keypoints_of(self.views, self.view, self.rays, self.point).finest
         off = spread_px * np.random.default_rng(seed).uniform(-1.0, 1.0, self.px.shape)
         off[finest == np.arange(len(off))] = 0.0
         rays = lens.rays_from_px(self.px + off)
         rays[finest == np.arange(len(off))] = self.rays[finest == np.arange(len(off))]
         return rays, finest
 
+    def plan(self, rays, options=OPTIONS):
+        """Numbers of all that are no finest, and how they are laid on."""
+        points = keypoints_of(self.views, self.view, rays, self.point)
+        which = np.flatnonzero(points.finest != np.arange(len(rays)))
+        return which, patch_plan(self.views, points, which, options)
+
     def aligned(self, rays, options=OPTIONS):
         """Aligned keypoints: numbers, errors in pixels (nan where they don't fit), deviations."""
-        plan = patch_plan(self.views, self.view, rays, self.point, OPTIONS)
-        others = plan.finest != np.arange(len(rays))
-        lens, numbers, errors, sigmas = self.camera.intrinsics, [], [], []
-        for number in range(len(self.views)):
-            which = np.flatnonzero(others & (self.view == number))
-            if len(which):
-                templates = empty_templates(len(which), options)
-                for other in range(len(self.views)):
-                    some = np.flatnonzero(plan.view[plan.finest[which]] == other)
-                    picture = self.pictures[other]
-                    fill_from(plan, other, which[some], some, picture, templates)
-                picture = self.pictures[number]
-                exact = aligned(plan, which, rays[which], picture, templates, options)
-                numbers.append(which)
-                errors.append(lens.px_from_rays(exact.rays) - self.px[which])
-                sigmas.append(exact.sigma * lens.focal_px)
-        return np.concatenate(numbers), np.concatenate(errors), np.concatenate(sigmas)
+        numbers, plan = self.plan(rays, options)
+        templates = empty_templates(len(numbers), options)
+        for other in np.unique(plan.finest_view):
+            some = np.flatnonzero(plan.finest_view == other)
+            fill_from(plan, some, self.pictures[other], templates)
+        px, sigma_px = np.empty((len(numbers), 2)), np.empty(len(numbers))
+        lens = self.camera.intrinsics
+        for number in np.unique(plan.view):
+            some = np.flatnonzero(plan.view == number)
+            exact = aligned(plan, some, self.pictures[number], templates, options)
+            px[some], sigma_px[some] = lens.px_from_rays(exact.rays), exact.sigma * lens.focal_px
+        return numbers, px - self.px[numbers], sigma_px
 
 
 @pytest.fixture(scope="module", params=[(), BARREL], ids=["pinhole", "barrel"])
@@ -142,9 +144,10 @@ def test_an_error_of_the_finest_is_shared_by_all_that_are_laid_on_it(world):
     lens = world.camera.intrinsics
     rays[own] = lens.rays_from_px(world.px[own] + np.array([0.4, -0.3]))
     numbers, errors, _ = world.aligned(rays)
-    plan = patch_plan(world.views, world.view, rays, world.point, OPTIONS)
+    _, plan = world.plan(rays)
+    assert len(numbers) == len(plan.map)
     # The map carries a pixel of theirs to one of the finest.
-    carried = (plan.map[numbers][:, :2, :2] @ errors[:, :, None])[:, :, 0]
+    carried = (plan.map[:, :2, :2] @ errors[:, :, None])[:, :, 0]
     fits = np.isfinite(carried[:, 0])
     assert fits.mean() > 0.9
     off = np.hypot(*(carried[fits] - np.array([0.4, -0.3])).T)
@@ -153,24 +156,26 @@ def test_an_error_of_the_finest_is_shared_by_all_that_are_laid_on_it(world):
 
 def test_maps_agree_with_going_by_way_of_the_floor(world):
     """To the last bit without distortion; else on average over the patch, which is what counts."""
-    plan = patch_plan(world.views, world.view, world.rays, world.point, OPTIONS)
+    numbers, plan = world.plan(world.rays)
+    finest = keypoints_of(world.views, world.view, world.rays, world.point).finest
     lens, known = world.camera.intrinsics, world.camera.mount.attitude
     side = 2 * OPTIONS.radius_px + 1
     off = np.stack(np.meshgrid(*2 * [np.arange(side) - OPTIONS.radius_px]), axis=-1).reshape(-1, 2)
     weight = _weight(side).ravel()
-    for number in range(0, len(world.view), 7):
-        view, other = int(plan.view[number]), int(plan.finest[number])
-        there = int(plan.view[other])
+    for number in range(0, len(numbers), 5):
+        mine, other = numbers[number], finest[numbers[number]]
+        view, there = int(world.view[mine]), int(world.view[other])
+        assert (plan.view[number], plan.finest_view[number]) == (view, there)
         # The attitudes told are not the true ones: where both think the point is differs.
         spots = [
             POSES[v].apply(floor_from_rays(known, world.rays[k][None]))
-            for v, k in ((view, number), (there, other))
+            for v, k in ((view, mine), (there, other))
         ]
         rays = lens.rays_from_px(plan.place[number] + off)
         floor = POSES[view].apply(floor_from_rays(known, rays)) + spots[1] - spots[0]
         seen = lens.px_from_rays(rays_from_floor(known, POSES[there].inverse().apply(floor)))
         mapped = np.column_stack([off, np.ones(len(off))]) @ plan.map[number].T
-        error = plan.place[other] + mapped[:, :2] / mapped[:, 2:] - seen
+        error = plan.finest_place[number] + mapped[:, :2] / mapped[:, 2:] - seen
         if lens.is_pinhole:
             assert np.abs(error).max() < 1e-6
         else:  # worst seen 0.007 and 0.11; without the bend's mean 0.04
@@ -249,9 +254,11 @@ def test_the_finest_picture_is_the_one_that_is_nearest():
     views = [PatchView(c, c.mount.attitude, Se2(0.0, 0.0, 0.0), lambda: None) for c in (far, near)]
     floor = np.array([[0.02, 0.01], [0.05, -0.03]])
     rays = np.vstack([rays_from_floor(v.attitude, floor) for v in views])
-    plan = patch_plan(views, np.array([0, 0, 1, 1]), rays, np.array([0, 1, 0, 1]), OPTIONS)
-    assert plan.finest.tolist() == [2, 3, 2, 3]
-    assert np.allclose(plan.map[2:], np.eye(3), atol=1e-9)
+    points = keypoints_of(views, np.array([0, 0, 1, 1]), rays, np.array([0, 1, 0, 1]))
+    assert points.finest.tolist() == [2, 3, 2, 3]
+    assert np.allclose(points.floor, np.vstack([floor, floor]))
+    # At half the height pixels lie half as far apart.
+    assert np.allclose(points.fineness[2:] / points.fineness[:2], 4.0, rtol=0.1)
 
 
 def test_reading_between_pixels_is_bilinear():

@@ -29,6 +29,7 @@ from groundfuse.frontend.arrays import Image
 from groundfuse.frontend.patches import (
     Aligned,
     Integers,
+    Keypoints,
     PatchOptions,
     PatchPlan,
     PatchView,
@@ -36,6 +37,7 @@ from groundfuse.frontend.patches import (
     empty_templates,
     fill_from,
     grey_picture,
+    keypoints_of,
     patch_plan,
 )
 from groundfuse.frontend.picture_cache import Cache
@@ -121,16 +123,17 @@ def aligned_edges(
     used, point = sampled(*tracks(links, sightings), sightings, most)
     if len(used) == 0:
         return tuple(edges)
-    rays = sightings.ray[used]
     views = _views(robots, placed, team, frames)
-    plan = patch_plan(views, sightings.frame[used], rays, point, options)
-    keys = _keys(_digests(robots, frames, options, desk), plan, rays)
-    found = _known(keys, plan, desk.store.latest(KIND) or NOTHING_KNOWN)
-    if _align(plan, rays, found, options, desk):
-        others = plan.finest != np.arange(len(used))
+    points = keypoints_of(views, sightings.frame[used], sightings.ray[used], point)
+    keys = _keys(_digests(robots, frames, options, desk), points)
+    found = _known(keys, points, desk.store.latest(KIND) or NOTHING_KNOWN)
+    left = np.flatnonzero(found[:, 3] == 0.0)
+    if len(left):
+        _align(views, points, left, found, options, desk)
+        others = points.finest != np.arange(len(used))
         known = KnownAlignments(*_sorted(keys[others], found[others, :3]))
         desk.store.save(key_of(KIND, known.keys), KIND, "team", packed(known))
-    exact = _with_finest(plan, rays, found)
+    exact = _with_finest(points, found)
     return _replaced(edges, sightings, links, used, exact, options.min_links)
 
 
@@ -168,14 +171,14 @@ def _digests(
     return np.array([int.from_bytes(digest[:7], "little") for digest in both], np.int64)
 
 
-def _keys(digests: Integers, plan: PatchPlan, rays: Array) -> Keys:
+def _keys(digests: Integers, points: Keypoints) -> Keys:
     """Return what stands for each keypoint and its finest, in their pictures."""
-    own = mixed_keys(digests[plan.view], rays)
-    keys: Keys = own ^ (own[plan.finest] * OTHER)
+    own = mixed_keys(digests[points.view], points.rays)
+    keys: Keys = own ^ (own[points.finest] * OTHER)
     return keys
 
 
-def _known(keys: Keys, plan: PatchPlan, known: KnownAlignments) -> Array:
+def _known(keys: Keys, points: Keypoints, known: KnownAlignments) -> Array:
     """Return (n, 4): what is known of each alignment, and whether it is."""
     found = np.full((len(keys), 4), np.nan)
     found[:, 3] = 0.0
@@ -183,57 +186,60 @@ def _known(keys: Keys, plan: PatchPlan, known: KnownAlignments) -> Array:
         place = np.minimum(np.searchsorted(known.keys, keys), len(known.keys) - 1)
         same = known.keys[place] == keys
         found[same, :3], found[same, 3] = known.found[place[same]], 1.0
-    found[plan.finest == np.arange(len(keys)), 3] = 1.0
+    found[points.finest == np.arange(len(keys)), 3] = 1.0
     return found
 
 
-def _align(plan: PatchPlan, rays: Array, found: Array, options: PatchOptions, desk: Desk) -> bool:
-    """Align what is not known yet and write it down; False where all is known.
+def _align(
+    views: Sequence[PatchView],
+    points: Keypoints,
+    left: Integers,
+    found: Array,
+    options: PatchOptions,
+    desk: Desk,
+) -> None:
+    """Align what is left and write it down.
 
-    The keypoints are numbered view by view. As many at a time as there is room for read their
-    patches, view by view of their finest, and are then laid on, view by view of their own: however
-    far apart two views of a place were taken, few pictures are read more than once.
+    As many keypoints at a time as there is room for read their patches, view by view of their
+    finest, and are then laid on, view by view of their own: however far apart two views of a place
+    were taken, few pictures are read more than once.
     """
-    left = np.flatnonzero(found[:, 3] == 0.0)
     pictures: Cache[Image] = Cache(
-        lambda number: grey_picture(plan.views[number], options), options.cache_bytes
+        lambda number: grey_picture(views[number], options), options.cache_bytes
     )
     most = max(1, options.cache_bytes // empty_templates(1, options).nbytes)
     parts = [left[first : first + most] for first in range(0, len(left), most)]
 
     def steps() -> Iterator[None]:
         for part in parts:
-            yield from _align_part(plan, part, rays, found, pictures.get, options, desk.num_threads)
+            plan, some = patch_plan(views, points, part, options), np.empty((len(part), 3))
+            yield from _align_part(plan, some, pictures.get, options, desk.num_threads)
+            found[part, :3] = some
 
-    total = sum(len(_by(n[part])) for part in parts for n in (plan.view, plan.view[plan.finest]))
+    total = sum(len(_by(points.view[n])) for part in parts for n in (part, points.finest[part]))
     for _ in desk.progress(steps(), total, "keypoints"):
         pass
-    return bool(len(left))
 
 
 def _align_part(
     plan: PatchPlan,
-    part: Integers,
-    rays: Array,
     found: Array,
     picture: Callable[[int], Image],
     options: PatchOptions,
     num_threads: int,
 ) -> Iterator[None]:
-    """Align keypoints, ascending; each view that patches are read from or laid on is a step."""
-    templates, seen_best = empty_templates(len(part), options), plan.view[plan.finest[part]]
+    """Align a plan's keypoints; each view that patches are read from or laid on is a step."""
+    templates = empty_templates(len(found), options)
 
-    def fill(places: Integers) -> None:
-        view = int(seen_best[places[0]])
-        fill_from(plan, view, part[places], places, picture(view), templates)
+    def fill(which: Integers) -> None:
+        fill_from(plan, which, picture(int(plan.finest_view[which[0]])), templates)
 
-    def lay(places: Integers) -> None:
-        which, view = part[places], int(plan.view[part[places[0]]])
-        exact = aligned(plan, which, rays[which], picture(view), templates[places], options)
+    def lay(which: Integers) -> None:
+        exact = aligned(plan, which, picture(int(plan.view[which[0]])), templates, options)
         found[which, :2], found[which, 2] = exact.rays, exact.sigma
 
-    yield from in_threads(fill, _by(seen_best), num_threads)
-    yield from in_threads(lay, _by(plan.view[part]), num_threads)
+    yield from in_threads(fill, _by(plan.finest_view), num_threads)
+    yield from in_threads(lay, _by(plan.view), num_threads)
 
 
 def _by(number: Integers) -> list[Integers]:
@@ -247,16 +253,16 @@ def _sorted(keys: Keys, found: Array) -> tuple[Keys, Array]:
     return keys[order], found[order]
 
 
-def _with_finest(plan: PatchPlan, rays: Array, found: Array) -> Aligned:
+def _with_finest(points: Keypoints, found: Array) -> Aligned:
     """Let the finest stay where they are, if another fits; they are as exact as those on average.
 
     Laid on a patch with an error of its own, the others share that error, which is as if all
     pictures, the finest too, had errors of their own.
     """
-    own = np.arange(len(rays))
-    fits = np.isfinite(found[:, 2]) & (plan.finest != own)
-    followers = np.bincount(plan.finest[fits], minlength=len(rays))
-    total = np.bincount(plan.finest[fits], found[fits, 2], minlength=len(rays))
+    rays, own = points.rays, np.arange(len(found))
+    fits = np.isfinite(found[:, 2]) & (points.finest != own)
+    followers = np.bincount(points.finest[fits], minlength=len(rays))
+    total = np.bincount(points.finest[fits], found[fits, 2], minlength=len(rays))
     exact, sigma = (
         np.where(fits[:, None], found[:, :2], np.nan),
         np.where(fits, found[:, 2], np.nan),
