@@ -10,9 +10,9 @@ from painted_team import HEIGHT_M, PAIR, QUICK, SIGMA, painted_pair
 from groundfuse.backend.bundle_tracks import sightings_from_edges
 from groundfuse.backend.measurement import Attitude, FrameId, RelativePose, Se2
 from groundfuse.frontend.overhead import floor_from_rays
-from groundfuse.frontend.patches import PatchOptions, empty_templates
+from groundfuse.frontend.patches import Keypoints, PatchOptions, empty_templates
 from groundfuse.tools import aligned_edges as module
-from groundfuse.tools.aligned_edges import KIND, Desk, aligned_edges
+from groundfuse.tools.aligned_edges import KIND, Desk, _keys, aligned_edges
 from groundfuse.tools.fuse_team import RunOptions
 from groundfuse.tools.pipeline import Stopwatch, fuse_robots
 from groundfuse.tools.settings import with_settings
@@ -177,6 +177,15 @@ def test_another_picture_of_the_same_name_is_aligned_anew(fused, accepted):
     aligned_edges(fused.robots, fused.robots, fused.team, accepted, OPTIONS, desk)
     gone = ~np.isin(before, store.latest(KIND).keys)
     assert 0 < gone.sum() < len(before)
+
+
+def test_an_alignment_is_known_by_both_pictures():
+    rays = np.array([[0.1, 0.2], [0.1, 0.25], [0.3, 0.1]])
+    number = np.array([0, 1, 1])
+    points = Keypoints(number, rays, rays, np.ones(3), np.array([0, 0, 2]))
+    keys = _keys(np.array([5, 6]), points)
+    assert (_keys(np.array([7, 6]), points) != keys).tolist() == [True, True, False]
+    assert (_keys(np.array([5, 7]), points) != keys).tolist() == [False, True, True]
 
 
 def test_pairs_that_would_keep_too_few_stay_as_they_are(fused, accepted):

@@ -137,6 +137,14 @@ def test_keypoints_come_back_to_where_they_are(world):
     assert np.median(error) < 0.5 * EXACT_PX
 
 
+def test_few_steps_are_enough(world):
+    """Newton's steps: each leaves the square of what was left; a wrong one creeps."""
+    rays, _ = world.seen(0.5)
+    _, _, sigmas = world.aligned(rays, replace(OPTIONS, steps=7))
+    _, _, patient = world.aligned(rays)
+    assert np.isfinite(sigmas).sum() > 0.9 * np.isfinite(patient).sum()
+
+
 def test_an_error_of_the_finest_is_shared_by_all_that_are_laid_on_it(world):
     """So the floor point moves, and nothing else does."""
     rays, finest = world.seen(0.0)

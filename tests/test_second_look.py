@@ -74,6 +74,14 @@ def test_a_look_is_worth_what_has_cost_pairs(tmp_path, numbers, worth):
     assert not is_worth_it(team, (), [found("B", used=False, **numbers)])
 
 
+def test_a_lens_that_is_known_very_well_is_not_worth_a_look_for_next_to_nothing(tmp_path):
+    team = robots(tmp_path)
+    for off, worth in ((5e-5, False), (-2e-4, True)):
+        focal = Estimated(off, 1e-6, 0.003, used=True)
+        mounts = [replace(found("B"), focal=focal)]
+        assert is_worth_it(team, (), mounts) == worth
+
+
 def test_frames_move_with_their_mount(tmp_path):
     after, same = corrected(robots(tmp_path), [found("A", tilt=0.02, roll=-0.01, height=0.01)])
     (frame,) = after.frames

@@ -25,7 +25,9 @@ from groundfuse.tools.robot import Robot
 WORTH_WOBBLE = 0.5
 """A mount this far off, in its pictures' own wobble, is worth another look."""
 WORTH_SIGMA = 1.0
-"""A lens is, where this much of its own sigma is still wrong."""
+"""A lens is, where this much of its own sigma is still wrong,"""
+WORTH_LENS = 1e-4
+"""and this much of its focal length: 0.03 px far out in a picture, a tenth of a detector's error."""
 
 
 def is_worth_it(
@@ -47,7 +49,7 @@ def is_worth_it(
         if np.any(change[:3] > WORTH_WOBBLE * np.array(own)):
             return True
         lens = [0.0 if f is None else f.sigma for f in (mount.focal, mount.distortion)]
-        if np.any(change[3:] > WORTH_SIGMA * np.array(lens)):
+        if np.any(change[3:] > np.maximum(WORTH_SIGMA * np.array(lens), WORTH_LENS)):
             return True
     return False
 
