@@ -27,7 +27,7 @@ WORTH_WOBBLE = 0.5
 WORTH_SIGMA = 1.0
 """A lens is, where this much of its own sigma is still wrong,"""
 WORTH_LENS = 1e-4
-"""and this much of its focal length: 0.03 px far out in a picture, a tenth of a detector's error."""
+"""and this much of its focal length: 0.03 px far out, a tenth of a keypoint's error."""
 
 
 def is_worth_it(
