@@ -125,8 +125,11 @@ def sealed(outline):
         (["O", "nowhere:Thing"], "there is no nowhere:Thing"),
         (["O", "backend.measurement:Thing"], "there is no backend.measurement:Thing"),
         (["O", "backend.measurement:FrameId"], "missing 2 required positional arguments"),
+        (["O", "backend.measurement:Se2", 1.0, 2.0], r"zip\(\) argument 2 is shorter"),
+        (["O", "backend.measurement:Se2", 1.0, 2.0, 3.0, 4.0], r"zip\(\) argument 2 is longer"),
         (["A", "|O", [1], 0], r"arrays of \|O are not known"),
         (["A", "<f8", [9], 0], "buffer"),
+        (["A", "<f8", [1], -8], "offset must be non-negative"),
         (["X", 1], "there is no kind 'X'"),
     ],
 )
