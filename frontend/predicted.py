@@ -6,7 +6,7 @@ any pair of its own needs another. Where the graph is dense already, one more pa
 """
 
 import functools
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -21,9 +21,9 @@ from groundfuse.frontend.footprint import footprint
 from groundfuse.frontend.overhead_view import OverheadOptions, raster_cell_m
 
 Pair = tuple[FrameId, FrameId]
-Frames = set[FrameId]
-Graph = dict[FrameId, Frames]
-Around = Callable[[FrameId], Frames]
+Places = set[int]
+Graph = list[Places]
+Around = Callable[[int], Places]
 BALLS_KEPT = 4096
 """Frames whose surroundings in the graph are remembered: some kilobytes each."""
 
@@ -83,55 +83,68 @@ def predicted_pairs(
         tried: pairs that need no second try.
         options: see `PredictedOptions`.
     """
-    graph: Graph = {frame: set() for frame in outlines}
-    for a, b in accepted:
-        if a in graph and b in graph:
-            graph[a].add(b)
-            graph[b].add(a)
-    known, least = set(tried), options.least_overlap
+    frames = sorted(outlines)
+    place = {frame: k for k, frame in enumerate(frames)}
+    graph: Graph = [set() for _ in frames]
+    for i, j in _numbered(accepted, place):
+        graph[i].add(j)
+        graph[j].add(i)
+    known = set(_numbered(tried, place))
 
-    def around(frame: FrameId) -> Frames:
-        return _ball(graph, frame, options)
+    def around(k: int) -> Places:
+        return _ball(graph, k, options)
 
     once = functools.lru_cache(BALLS_KEPT)(around)
+    shapes = [outlines[frame] for frame in frames]
     # Edges are only ever added: what is held well now is held well later.
     weak = [
-        pair
-        for pair in _close_by(outlines, component_of)
-        if pair not in known and not _held(graph, *pair, once, options)
+        (i, j)
+        for i, j in _close_by(shapes, [component_of.get(frame, -1) for frame in frames])
+        if (i, j) not in known and not _held(graph, i, j, once, options)
     ]
-    shares = [(_overlap(outlines[a], outlines[b]), a, b) for a, b in weak]
-    shared = [(-share, a, b) for share, a, b in shares if share >= least]
+    shares = [(_overlap(shapes[i], shapes[j]), i, j) for i, j in weak]
+    shared = [(-share, i, j) for share, i, j in shares if share >= options.least_overlap]
     chosen: list[Pair] = []
-    of_frame = dict.fromkeys(outlines, 0)
-    for _, a, b in sorted(shared):
-        full = max(of_frame[a], of_frame[b]) >= options.num_frames
-        if full or _held(graph, a, b, around, options):
+    of_frame = [0] * len(frames)
+    for _, i, j in sorted(shared):
+        full = max(of_frame[i], of_frame[j]) >= options.num_frames
+        if full or _held(graph, i, j, around, options):
             continue
-        chosen.append((a, b))
-        for one, other in ((a, b), (b, a)):
+        chosen.append((frames[i], frames[j]))
+        for one, other in ((i, j), (j, i)):
             graph[one].add(other)  # as if it were accepted: its neighbours need no other
             of_frame[one] += 1
     return chosen
 
 
-def _close_by(
-    outlines: Mapping[FrameId, Points], component_of: Mapping[FrameId, int]
-) -> list[Pair]:
-    """Return the pairs of one component whose floors may touch: the circles around them do."""
-    frames = [f for f in sorted(outlines) if len(outlines[f]) >= 3 and f in component_of]
-    if len(frames) < 2:
+def _numbered(pairs: Collection[Pair], place: Mapping[FrameId, int]) -> Iterator[tuple[int, int]]:
+    """Yield pairs as places, which are much quicker to look up; those of other frames are left."""
+    for a, b in pairs:
+        if a in place and b in place:
+            yield place[a], place[b]
+
+
+def _close_by(shapes: Sequence[Points], component_of: Sequence[int]) -> list[tuple[int, int]]:
+    """Return the pairs of one component whose floors may touch: the circles around them do.
+
+    Args:
+        shapes: outlines of all frames.
+        component_of: each frame's component, -1 for none.
+    """
+    seen = zip(shapes, component_of, strict=True)
+    some = np.array([k for k, (shape, c) in enumerate(seen) if len(shape) >= 3 and c >= 0])
+    if len(some) < 2:
         return []
-    middle = np.array([outlines[frame].mean(axis=0) for frame in frames])
+    middle = np.array([shapes[k].mean(axis=0) for k in some])
     reach = np.array(
-        [np.hypot(*(outlines[f] - m).T).max() for f, m in zip(frames, middle, strict=True)]
+        [np.hypot(*(shapes[k] - m).T).max() for k, m in zip(some, middle, strict=True)]
     )
-    component = np.array([component_of[frame] for frame in frames])
+    component = np.array(component_of)[some]
     pairs = KDTree(middle).query_pairs(2.0 * float(reach.max()), output_type="ndarray")
     i, j = pairs[np.lexsort(pairs.T[::-1])].T
     apart_m = np.hypot(*(middle[i] - middle[j]).T)
     kept = (apart_m < reach[i] + reach[j]) & (component[i] == component[j])
-    return [(frames[k], frames[m]) for k, m in zip(i[kept], j[kept], strict=True)]
+    return list(zip(some[i[kept]].tolist(), some[j[kept]].tolist(), strict=True))
 
 
 def _overlap(a: Points, b: Points) -> float:
@@ -142,16 +155,16 @@ def _overlap(a: Points, b: Points) -> float:
     return cv2.intersectConvexConvex(one, other)[0] / smaller if smaller > 0.0 else 0.0
 
 
-def _held(graph: Graph, a: FrameId, b: FrameId, around: Around, options: PredictedOptions) -> bool:
+def _held(graph: Graph, i: int, j: int, around: Around, options: PredictedOptions) -> bool:
     """Whether two views have pairs enough, and a short way leads from one to the other."""
-    few = min(len(graph[a]), len(graph[b])) < options.least_pairs
-    return not few and not around(a).isdisjoint(around(b))
+    few = min(len(graph[i]), len(graph[j])) < options.least_pairs
+    return not few and not around(i).isdisjoint(around(j))
 
 
-def _ball(graph: Graph, middle: FrameId, options: PredictedOptions) -> Frames:
+def _ball(graph: Graph, middle: int, options: PredictedOptions) -> Places:
     """Frames within half of `near_edges` edges: two such balls meet where the way is short."""
     found, rim = {middle}, {middle}
     for _ in range(options.near_edges // 2):
-        rim = set().union(*(graph[frame] for frame in rim)) - found
+        rim = set().union(*(graph[k] for k in rim)) - found
         found |= rim
     return found
