@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from groundfuse.backend import planar
 from groundfuse.backend.chain import Forest
+from groundfuse.backend.consistency_compiled import agreeing
 from groundfuse.backend.problem import Array, Indices, Problem
 
 Flags = NDArray[np.bool_]
@@ -70,9 +71,6 @@ def noise_between(one: Links, two: Links, forest: Forest) -> Array:
 
 def agreement(edges: Links, forest: Forest, limit: float) -> Flags:
     """Return (m, m) whether edges agree pairwise: chi2 of their cycle at most `limit`."""
-    m = len(edges.a)
-    row, column = np.triu_indices(m, 1)
-    agrees = np.eye(m, dtype=bool)
-    close = chi2_between(edges.of(row), edges.of(column), forest) <= limit
-    agrees[row[close], column[close]] = True
-    return agrees | agrees.T
+    agrees = np.empty((len(edges.a), len(edges.a)), dtype=bool)
+    agreeing(edges, (forest.depth, forest.ancestors, forest.spatial), limit, agrees)
+    return agrees

@@ -72,6 +72,30 @@ def test_wrong_overlaps_agree_with_nothing():
     assert agrees[np.ix_(wrong, ~wrong)].mean() < 0.02
 
 
+@pytest.mark.parametrize("joined", [False, True])
+def test_all_pairs_at_once_are_judged_as_pairs_are(joined):
+    """The compiled loop against numpy, on paths and on trees that branch, at every limit."""
+    _, found, chains, _ = parts(5, robots=3, frames=30, overlaps=8, wrong_overlaps=0.3, loops=0)
+    if joined:
+        chains = skeleton.joined(found.team, found.verdict.best.tree)
+        assert (np.bincount(chains.ancestors[0]) > 2).any()
+    edges = links(found.team.joins, chains)
+    row, column = np.triu_indices(len(edges.a), 1)
+    one, other = chains.part[edges.a[row]], chains.part[edges.b[row]]
+    alike = (one == chains.part[edges.a[column]]) & (other == chains.part[edges.b[column]])
+    row, column = row[alike], column[alike]  # ends of other maps have no chain between them
+    chi2 = chi2_between(edges.of(row), edges.of(column), chains)
+    assert len(chi2) > 50
+    # Two ways to solve 3x3 of condition 1e4 in doubles: 1e-12. 1e-13 would do, 1e-14 would not.
+    for value in chi2:
+        above = agreement(edges, chains, value * (1.0 + 1e-11))
+        below = agreement(edges, chains, value * (1.0 - 1e-11))
+        assert np.array_equal(above, above.T)
+        assert above.diagonal().all()
+        assert np.array_equal(above[row, column], chi2 <= value * (1.0 + 1e-11))
+        assert np.array_equal(below[row, column], chi2 <= value * (1.0 - 1e-11))
+
+
 def test_links_do_not_depend_on_how_a_map_is_turned():
     """The chi2 of a cycle is a number; only its coordinates depend on the map's frame."""
     _, found, chains, _ = parts(4, frames=20, overlaps=5, loops=0)
