@@ -38,10 +38,12 @@ def largest_clique(adjacent: NDArray[np.bool_]) -> NDArray[np.int64]:
             continue
         visits += 1
         node, _, remaining = branch
-        grown = [*chosen, node]
-        if len(grown) > len(best):
-            best = grown
-        stack.append((grown, _coloured(sets, remaining & sets[node])))
+        grown, remaining = [*chosen, node], remaining & sets[node]
+        whole = [*grown, *_nodes(remaining)] if _is_clique(sets, remaining) else grown
+        if len(whole) > len(best):
+            best = whole
+        if whole is grown:
+            stack.append((grown, _coloured(sets, remaining)))
     return np.sort(order[np.array(best, dtype=np.int64)])
 
 
@@ -53,6 +55,18 @@ def _greedy(sets: list[int]) -> list[int]:
         chosen.append(node)
         candidates &= sets[node]
     return chosen
+
+
+def _nodes(among: int) -> Iterator[int]:
+    """Yield the nodes of a set, ascending."""
+    while among:
+        yield (among & -among).bit_length() - 1
+        among &= among - 1
+
+
+def _is_clique(sets: list[int], among: int) -> bool:
+    """Return whether all nodes of a set are adjacent to each other."""
+    return all(among & ~sets[node] == 1 << node for node in _nodes(among))
 
 
 def _coloured(sets: list[int], candidates: int) -> Iterator[tuple[int, int, int]]:
