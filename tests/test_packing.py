@@ -5,6 +5,7 @@ import math
 import pickle
 import struct
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -91,6 +92,27 @@ def test_our_own_values_come_back():
     np.testing.assert_array_equal(again.correspondences.rays_b, edge().correspondences.rays_b)
 
 
+class Empty(NamedTuple):
+    """A class of ours without parts (by the module it says it is of)."""
+
+
+Empty.__module__ = "groundfuse.backend.measurement"
+
+
+def test_many_of_a_class_lie_column_by_column_and_come_back_alike():
+    frames = tuple(FrameId("AB"[k % 2], k) for k in range(9))
+    turned = (Rejected(*frames[:2], Reason.PRIOR, 1.0, 2.0), Rejected(*frames[1:3], None, 3, 4.0))
+    for value in (frames, turned, (turned, turned[:1]), dict.fromkeys(frames, turned), ((), ())):
+        assert unpacked(packed(value)) == value
+    many = packed(frames)
+    assert many.count(b"FrameId") == 1
+    edges = unpacked(packed(tuple(edge(seed) for seed in range(5))))
+    assert [packed(again) for again in edges] == [packed(edge(seed)) for seed in range(5)]
+    assert {type(again) for again in edges} == {RelativePose}
+    nothing = (Empty(), Empty())  # no column tells how many
+    assert key_of(nothing) != key_of((Empty(),))
+
+
 def test_numbers_of_numpy_come_back_as_pythons():
     assert unpacked(packed((np.float64(0.1), np.int64(3), np.bool_(True)))) == (0.1, 3, True)  # noqa: FBT003
 
@@ -130,6 +152,10 @@ def sealed(outline):
         (["A", "|O", [1], 0], r"arrays of \|O are not known"),
         (["A", "<f8", [9], 0], "buffer"),
         (["A", "<f8", [1], -8], "offset must be non-negative"),
+        (["C", "backend.measurement:Se2", ["T", 1.0, 2.0], ["T", 1.0], ["T"]], "shorter"),
+        (["C", "backend.measurement:FrameId", ["T", "A"]], "missing 1 required positional"),
+        (["C", "tools.store:Store", ["T"]], "tools.store:Store does not hold values"),
+        (["D", 1, 2, 3], "shorter"),
         (["X", 1], "there is no kind 'X'"),
     ],
 )

@@ -17,7 +17,7 @@ import json
 import math
 import operator
 import struct
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from typing import Any
 
@@ -116,12 +116,12 @@ def _outlines(values: Iterable[Any], arrays: _Arrays) -> list[Any]:
 
 
 @functools.cache
-def _writer(kind: type) -> Callable[[Any, _Arrays], Any]:  # noqa: PLR0911
+def _writer(kind: Any) -> Callable[[Any, _Arrays], Any]:  # noqa: ANN401, PLR0911
     """Return what writes the outlines of a type's values."""
     if kind is bytes:
         return lambda value, _: ["B", value.hex()]
     if kind is tuple or kind is list:
-        return lambda value, arrays: ["T", *_outlines(value, arrays)]
+        return _row
     if issubclass(kind, enum.Enum):
         name = _name(kind)
         return lambda value, _: ["E", name, value.value]
@@ -143,13 +143,33 @@ def _writer(kind: type) -> Callable[[Any, _Arrays], Any]:  # noqa: PLR0911
     return lambda value, arrays: ["O", name, *_outlines(parts(value), arrays)]
 
 
-def _name(kind: type) -> str:
+def _row(values: Sequence[Any], arrays: _Arrays) -> Any:  # noqa: ANN401
+    """Return the outline of a sequence: if all are of one class of ours, column by column.
+
+    So names stand once and not thousands of times, and each column is quick to make and to read.
+    """
+    kinds: set[Any] = {type(value) for value in values}
+    if len(kinds) == 1 and len(values) > 1 and _holds_parts(kind := kinds.pop()):
+        columns = zip(*map(_parts(kind), values), strict=True)
+        return ["C", _name(kind), *[_row(column, arrays) for column in columns]]
+    return ["T", *_outlines(values, arrays)]
+
+
+@functools.cache
+def _holds_parts(kind: Any) -> bool:  # noqa: ANN401
+    """Return whether a class's values are made of parts."""
+    return bool(fields(kind) if is_dataclass(kind) else getattr(kind, "_fields", ()))
+
+
+@functools.cache
+def _name(kind: Any) -> str:  # noqa: ANN401
     """Return where a value's class lies: `frontend.fit:Prior`."""
     if not kind.__module__.startswith(OURS):
         raise TypeError(f"a {kind.__name__} can't be packed")
     return f"{kind.__module__.removeprefix(OURS)}:{kind.__name__}"
 
 
+@functools.cache
 def _parts(kind: Any) -> Callable[[Any], Iterable[Any]]:  # noqa: ANN401
     """Return what takes a class's values apart."""
     if not is_dataclass(kind):
@@ -213,11 +233,14 @@ def _value(outline: Any, arrays: memoryview) -> Any:  # noqa: ANN401, PLR0911
         return bytes.fromhex(outline[1])
     if kind == "E":
         return _kind(outline[1])(outline[2])
-    inner = _values(outline[1:], arrays)
+    if kind == "C":
+        rows = zip(*_values(outline[2:], arrays), strict=True)
+        return tuple(itertools.starmap(_maker(outline[1]), rows))
     if kind == "D":
+        inner = _values(outline[1:], arrays)
         return dict(zip(inner[::2], inner[1::2], strict=True))
     if kind == "T":
-        return tuple(inner)
+        return tuple(_values(outline[1:], arrays))
     raise ValueError(f"there is no kind {kind!r}")
 
 
