@@ -109,7 +109,8 @@ def test_one_worker_is_killed_and_one_joins_midway(machines, by_threads):
                 machines.workers[0].send_signal(signal.SIGKILL)
             yield item
 
-    with Cluster(machines.address, patience_s=3.0) as cluster:
+    with Cluster(machines.address, num_threads=2, patience_s=3.0) as cluster:
+        assert cluster.num_threads == 2
         assert run(cluster, progress) == by_threads
         assert shown == {"features": (7, 7), "pairs": (21, 21)}
 

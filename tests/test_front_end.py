@@ -27,12 +27,14 @@ from groundfuse.frontend.overhead import floor_from_rays
 from groundfuse.frontend.pairs import PairOptions
 from groundfuse.frontend.repetition import REPEATS
 from groundfuse.frontend.retrieval import RetrievalOptions
+from groundfuse.tools import front_end
 from groundfuse.tools.errors import DataError
 from groundfuse.tools.front_end import FrontEndResult, run_front_end
 from groundfuse.tools.front_end_options import FrontEndOptions, Matcher, with_matcher
 from groundfuse.tools.overlap import true_overlap
 from groundfuse.tools.pair_verdict import Spot, compare, look, odometry_gate, swayed
 from groundfuse.tools.robot import Frame, Odometry, Robot
+from groundfuse.tools.similar import similar_pairs
 from groundfuse.tools.store import Store
 from groundfuse.tools.workers import AHEAD, Threads, in_threads
 
@@ -187,6 +189,30 @@ def assert_same(one, two):
 def test_neither_workers_nor_order_matter(team, found):
     """To the bit: three threads, the robots the other way round."""
     assert_same(run(team[::-1], workers=3), found)
+
+
+class Elsewhere:
+    """Gives its work away, as a cluster does, but has threads here."""
+
+    num_threads = 3
+
+    def __init__(self):
+        self.look, self.compare = Threads(1).look, Threads(1).compare
+
+
+def test_what_is_not_given_away_uses_the_threads_there_are_here(team, found, monkeypatch):
+    """Retrieval is done here, whoever looks and compares."""
+    asked = []
+
+    def counted(*arguments):
+        asked.append(arguments[-1])
+        return similar_pairs(*arguments)
+
+    monkeypatch.setattr(front_end, "similar_pairs", counted)
+    for workers in (Elsewhere(), Threads(2)):
+        stage = contextlib.nullcontext
+        assert_same(run_front_end(team, OPTIONS, workers, Store(), silent, stage), found)
+    assert asked == [3, 2]
 
 
 def test_an_unreadable_picture_stops_with_its_path(folder):

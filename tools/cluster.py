@@ -31,18 +31,26 @@ MOST_HELD_BYTES = 200_000_000
 class Cluster:
     """A cluster that was found to compute what this machine would.
 
+    Args:
+        address: of its scheduler.
+        num_threads: of this process, for the work that is not given away.
+        patience_s: how long a cluster without workers is waited for.
+
     Raises:
         TeamError: no scheduler answers, or one of its machines is not fit for the work.
     """
 
-    def __init__(self, address: str, *, patience_s: float = PATIENCE_S) -> None:
+    def __init__(
+        self, address: str, *, num_threads: int = 1, patience_s: float = PATIENCE_S
+    ) -> None:
         self.address = address
+        self.num_threads = num_threads
         self._patience_s = patience_s
         self._client = connected(address)
         self._badge = badge()
         self._held: OrderedDict[bytes, tuple[Any, int]] = OrderedDict()
         self._alone_since_s: float | None = None
-        self._num_threads, self._counted_s = 0, -math.inf
+        self._num_theirs, self._counted_s = 0, -math.inf
         why: str | None = "the check did not end"
         try:
             why = refusal_of(self._client, self._badge)
@@ -151,8 +159,8 @@ class Cluster:
     def _room(self, num_under_way: int) -> int:
         """Return how many orders more would keep the cluster busy; it is counted once a second."""
         if time.monotonic() - self._counted_s > 1.0:
-            self._num_threads, self._counted_s = self._count(), time.monotonic()
-        return max(AHEAD * self._num_threads, 1) - num_under_way
+            self._num_theirs, self._counted_s = self._count(), time.monotonic()
+        return max(AHEAD * self._num_theirs, 1) - num_under_way
 
     def _count(self) -> int:
         try:

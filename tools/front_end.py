@@ -20,7 +20,7 @@ from groundfuse.tools.robot import Robot
 from groundfuse.tools.shelf import AllFeatures, Shelf
 from groundfuse.tools.similar import similar_pairs
 from groundfuse.tools.store import Store
-from groundfuse.tools.workers import Progress, Threads, Workers, in_threads
+from groundfuse.tools.workers import Progress, Workers, in_threads
 
 Stage = Callable[[str], AbstractContextManager[None]]
 READERS = 4
@@ -109,9 +109,8 @@ class FrontEnd:
         self._num_further = 0
         with stage("retrieval"):
             looks = {frame: spots[frame].key for frame in self._order}
-            threads = workers.num_threads if isinstance(workers, Threads) else 1
             seen, how = AllFeatures(shelf, looks), options.pairs.retrieval
-            similar = similar_pairs(looks, seen, how, store, threads)
+            similar = similar_pairs(looks, seen, how, store, workers.num_threads)
         with stage("pairs"):
             self._tried.add([*neighbour_pairs(self._order), *similar], "pairs")
             for skip in range(2, options.pairs.max_skip + 1):

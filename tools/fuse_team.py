@@ -140,7 +140,7 @@ def _workers(asked: argparse.Namespace) -> AbstractContextManager[Workers]:
         return nullcontext(Threads(asked.workers))
     from groundfuse.tools.cluster import Cluster  # noqa: PLC0415 - takes a second, seldom needed
 
-    return Cluster(asked.scheduler)
+    return Cluster(asked.scheduler, num_threads=asked.workers)
 
 
 def _fused(desk: _Desk, robots: Sequence[Robot], workers: Workers) -> tuple[Fused, set[str]]:

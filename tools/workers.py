@@ -25,6 +25,11 @@ class Progress(Protocol):
 class Workers(Protocol):
     """Carry out work orders; whoever does it, the bytes are the same."""
 
+    @property
+    def num_threads(self) -> int:
+        """Threads of this process, for the work that is not given away."""
+        ...
+
     def look(
         self, jobs: Sequence[LookJob], options: FrontEndOptions
     ) -> Generator[tuple[LookJob, bytes], None, None]:
