@@ -12,7 +12,7 @@ from map_world import circle, edge, small_mosaic, small_team
 from groundfuse.backend.measurement import FrameId, Se2, TeamEstimate
 from groundfuse.tools import canvas as canvas_module
 from groundfuse.tools import drawing
-from groundfuse.tools.canvas import Canvas, dash_pieces, text_width_px
+from groundfuse.tools.canvas import SUPER, Canvas, dash_pieces, text_width_px
 from groundfuse.tools.drawing import LEFT_PX, TOP_PX, DrawingOptions, draw_location_graph
 from groundfuse.tools.drawing_component import EdgeKind, graph_of
 from groundfuse.tools.drawing_graph import (
@@ -209,16 +209,17 @@ def test_covariance_is_turned_to_the_axes_of_the_map():
         np.testing.assert_allclose(graph.covariance[frame], expected, atol=1e-18)
 
 
-def test_ellipse_is_as_large_as_its_covariance():
+@pytest.mark.parametrize("size", [1.0, 0.1, 0.03])
+def test_ellipse_is_as_large_as_its_covariance(size):
     canvas = Canvas(200, 200, WHITE)
-    axis, angle = np.array([60.0, 20.0]), 0.5
+    axis, angle = size * np.array([60.0, 20.0]), 0.5
     turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
     draw_ellipse(canvas, np.array([100.0, 100.0]), turn @ np.diag(axis**2) @ turn.T, (0, 0, 0))
     drawn = np.argwhere((canvas.finished() < 250).any(axis=2)) - 100.0
     along = drawn @ np.array([-math.sin(angle), math.cos(angle)])  # rows count downwards
     across = drawn @ np.array([math.cos(angle), math.sin(angle)])
-    assert along.max() == pytest.approx(60.0, abs=3.0)
-    assert across.max() == pytest.approx(20.0, abs=3.0)
+    assert along.max() == pytest.approx(axis[0], abs=3.0)
+    assert across.max() == pytest.approx(axis[1], abs=3.0)
 
 
 @pytest.mark.parametrize(("heading_rad", "way"), [(0.0, (1, 0)), (math.pi / 2, (0, -1))])
@@ -278,11 +279,26 @@ def test_mosaic_and_graph_share_one_place():
     assert np.mean(found[0]) == pytest.approx(v, abs=1.0)
 
 
-def test_rows_drawn_together_change_nothing(monkeypatch):
-    mosaic, (team, edges) = small_mosaic(), small_team()
-    whole = draw_location_graph(mosaic, team, edges)
-    monkeypatch.setattr(drawing, "ROWS_AT_ONCE", 7)
-    np.testing.assert_array_equal(draw_location_graph(mosaic, team, edges), whole)
+# Cover, floor and their sum are rounded to whole levels: three halves. Worst seen 1.
+FLAT_LEVELS = 2
+
+
+@pytest.mark.parametrize("longest_px", [60, 150, 900])  # much smaller, smaller and larger cells
+def test_no_dark_border_lies_around_floor_that_was_seen(longest_px):
+    mosaic, (team, edges) = small_mosaic(rows=121, columns=400), small_team()
+    seen = np.random.default_rng(2).random(mosaic.count.shape) < 0.5
+    mosaic.count[:] = seen
+    mosaic.floor[:] = np.where(seen[..., None], np.array(PAPER), 0)
+    canvas = Canvas(1000, 600, PAPER)
+    graph = graph_of(team, edges, 0, {})
+    placing, _, _ = drawing._placed(mosaic, graph, DrawingOptions(longest_px=longest_px))
+    drawing._draw_mosaic(canvas, mosaic, placing, 0.3)
+    assert np.abs(canvas.image.astype(int) - PAPER).max() <= FLAT_LEVELS
+    mosaic.floor[seen] = 0  # black floor is faded by as much as was asked for, and shows its share
+    drawing._draw_mosaic(canvas, mosaic, placing, 0.3)
+    shown = (PAPER - canvas.image.astype(float)).sum() / (0.7 * sum(PAPER) * SUPER**2)
+    area = seen.sum() * (mosaic.m_per_px * placing.px_per_m) ** 2
+    assert shown == pytest.approx(area, rel=0.05)
 
 
 def pixels_of(image, colour, tolerance=40):

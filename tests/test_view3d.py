@@ -12,6 +12,7 @@ import pytest
 from map_world import circle, edge, small_mosaic, small_team
 
 from groundfuse.backend.measurement import EdgeVerdict, FrameId, Se2, TeamEstimate
+from groundfuse.tools import map_points as map_points_module
 from groundfuse.tools import open3d_import, view3d
 from groundfuse.tools.drawing_style import robot_colour
 from groundfuse.tools.errors import DataError, TeamError
@@ -100,6 +101,15 @@ def test_thinned_floor_keeps_place_and_colour():
     np.testing.assert_allclose(found.points.mean(axis=0), whole.points.mean(axis=0), atol=0.01)
     assert found.colours.min() >= 85  # black of unseen cells is not mixed in
     assert abs(found.colours.mean() - whole.colours.mean()) < 0.5
+
+
+def test_rows_thinned_together_change_nothing(monkeypatch):
+    mosaic = small_mosaic(rows=121, columns=203)
+    found, _ = floor_points(mosaic, 3000)
+    monkeypatch.setattr(map_points_module, "ROWS_AT_ONCE", 7)
+    again, _ = floor_points(mosaic, 3000)
+    np.testing.assert_array_equal(again.points, found.points)
+    np.testing.assert_array_equal(again.colours, found.colours)
 
 
 def test_trajectories_float_over_the_floor_in_their_colours():

@@ -77,7 +77,9 @@ class Canvas:
         casing: Colour | None = None,
     ) -> None:
         """Draw a dashed line through points (n, 2)."""
-        pieces = [_fixed(piece) for piece in dash_pieces(points, dash_px, gap_px)]
+        cut = dash_pieces(points, dash_px, gap_px)
+        ends = np.cumsum([len(piece) for piece in cut])[:-1]
+        pieces = np.split(_fixed(np.vstack(cut)), ends) if cut else []
         if casing is not None:
             self._polylines(pieces, casing, width_px + 2.0, closed=False)
         self._polylines(pieces, colour, width_px, closed=False)

@@ -33,8 +33,7 @@ LEAST_HEIGHT_PX = 420
 MARGIN_SHARE = 0.03
 """Free border around mosaic and trajectories, of the longer side."""
 TICKS = 7.0
-ROWS_AT_ONCE = 32
-"""Rows of the picture that stay in the processor's cache."""
+FULL = 255
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,20 +109,21 @@ def _draw_mosaic(canvas: Canvas, mosaic: Mosaic, placing: Placing, paleness: flo
     size = np.array([columns, rows]) * mosaic.m_per_px * placing.px_per_m
     left, top = (round(value) for value in (placing.px(corner)[0] * SUPER).tolist())
     wide, tall = (max(1, round(value)) for value in (size * SUPER).tolist())
-    how = cv2.INTER_AREA if wide < columns else cv2.INTER_LINEAR
-    seen = (mosaic.count > 0).astype(np.float32)
-    alpha = np.asarray(cv2.resize(seen, (wide, tall), interpolation=how))
-    floor = np.asarray(cv2.resize(mosaic.floor, (wide, tall), interpolation=how))
+    # The canvas is halved at the end: down to half its size, a mosaic needs no means of areas here.
+    how = cv2.INTER_AREA if SUPER * wide < columns else cv2.INTER_LINEAR
+    seen = np.uint8(FULL) * (mosaic.count > 0).view(np.uint8)
+    cover = np.asarray(cv2.resize(seen, (wide, tall), interpolation=how), dtype=np.uint8)
+    floor = np.asarray(cv2.resize(mosaic.floor, (wide, tall), interpolation=how), dtype=np.uint8)
     window = canvas.image[top : top + tall, left : left + wide]
+    partly = np.nonzero((cover > 0) & (cover < FULL))
     # Unseen cells are black in the floor: where some were averaged in, paper fills what is missing.
-    paper = np.tile(np.array(PAPER, np.float32) * np.float32(paleness), wide)
-    for row in range(0, tall, ROWS_AT_ONCE):
-        rows = slice(row, row + ROWS_AT_ONCE)
-        lit = floor[rows].reshape(-1, 3 * wide).astype(np.float32) * np.float32(1.0 - paleness)
-        cover = np.repeat(alpha[rows], 3, axis=1)
-        shown = lit + cover * paper + window[rows].reshape(-1, 3 * wide) * (1.0 - cover)
-        whole = np.clip(np.rint(shown), 0, 255).astype(np.uint8)
-        window[rows] = whole.reshape(-1, wide, 3)
+    share = cover[partly][:, None] / FULL
+    paper = np.array(PAPER) * paleness
+    lit = floor[partly] * (1.0 - paleness) + share * paper + (1.0 - share) * window[partly]
+    table = np.rint(np.arange(256.0)[:, None] * (1.0 - paleness) + paper).astype(np.uint8)
+    pale = cv2.LUT(floor, table[None])
+    cv2.copyTo(pale, (cover == FULL).view(np.uint8), window)
+    window[partly] = np.clip(np.rint(lit), 0, FULL).astype(np.uint8)
 
 
 def _draw_axes(canvas: Canvas, placing: Placing, width: int, height: int) -> None:

@@ -23,6 +23,9 @@ from groundfuse.tools.drawing_style import (
 NUM_SIGMAS = 3.0
 ELLIPSE_MARKERS = 5.0
 """The largest ellipse is drawn with a half axis of up to this many markers' radii."""
+CHORD_PX = 0.1
+"""How far the corners of an ellipse are apart: its sides are off the curve by no more."""
+FEWEST_CORNERS = 12
 LARGEST_MARKER_PX = 11.0
 SMALLEST_MARKER_PX = 3.0
 STEP_SHARE = 0.24
@@ -112,7 +115,7 @@ def draw_cone(
     canvas: Canvas, foot: Floats, heading_rad: float, length_px: float, colour: Colour
 ) -> None:
     """Draw where a camera looks: a cone that opens along its heading (x right, y up)."""
-    angles = heading_rad + np.linspace(-0.42, 0.42, 9)
+    angles = heading_rad + np.linspace(-0.42, 0.42, 5)
     arc = foot + length_px * np.column_stack([np.cos(angles), -np.sin(angles)])
     outline = np.vstack([foot, arc])
     canvas.polygon(outline, mixed(colour, WHITE, 0.25), opacity=0.55)
@@ -122,8 +125,11 @@ def draw_cone(
 def draw_ellipse(canvas: Canvas, centre: Floats, covariance_px: Floats, colour: Colour) -> None:
     """Draw the outline where x' C^-1 x = 1 around a point, y up."""
     values, axes = np.linalg.eigh(covariance_px)
-    turn = np.linspace(0.0, 2.0 * math.pi, 49)[:-1]
-    round_ = np.column_stack([np.cos(turn), np.sin(turn)]) * np.sqrt(np.maximum(values, 0.0))
+    radii = np.sqrt(np.maximum(values, 0.0))
+    # A chord of n in a circle is off it by r (1 - cos(pi / n)), about r pi^2 / (2 n^2).
+    corners = math.ceil(math.pi * math.sqrt(float(radii.max()) / (2.0 * CHORD_PX)))
+    turn = np.arange(max(corners, FEWEST_CORNERS)) * (2.0 * math.pi / max(corners, FEWEST_CORNERS))
+    round_ = np.column_stack([np.cos(turn), np.sin(turn)]) * radii
     outline = centre + (round_ @ axes.T) * (1.0, -1.0)
     canvas.polygon(outline, colour, opacity=0.22)
     canvas.line(outline, mixed(colour, INK, 0.25), 1.5, closed=True, casing=WHITE)

@@ -20,6 +20,8 @@ MOST_POINTS = 1_000_000
 """Of the floor: 15 MB in a file, and any viewer turns it smoothly."""
 RIBBON_SHARE = 0.003
 """Half the width of a trajectory's ribbon of points, of the map's longer side."""
+ROWS_AT_ONCE = 16
+"""Rows of the thinned picture that are made from what the processor's cache holds."""
 LIFT_SHARE = 0.01
 """How far trajectories float over the floor, of the map's longer side."""
 
@@ -67,27 +69,34 @@ def map_points(
 
 def floor_points(mosaic: Mosaic, most_points: int) -> tuple[MapPoints, float]:
     """Return the seen floor, at most about so many points, and their spacing in m."""
-    seen = (mosaic.count > 0).astype(np.float32)
-    stride = max(1, math.ceil(math.sqrt(float(seen.sum()) / most_points)))
-    rows, columns = (math.ceil(side / stride) for side in seen.shape)
-    below, right = rows * stride - seen.shape[0], columns * stride - seen.shape[1]
-    share = _thinned(np.pad(seen, ((0, below), (0, right))), stride)
-    colour = _thinned(np.pad(mosaic.floor, ((0, below), (0, right), (0, 0))), stride)
-    row, column = np.nonzero(share >= 0.5)
+    seen = mosaic.count > 0
+    stride = max(1, math.ceil(math.sqrt(np.count_nonzero(seen) / most_points)))
+    share, colour = _thinned(seen.view(np.uint8), stride), _thinned(mosaic.floor, stride)
+    shown = share >= 0.5
+    row, column = np.nonzero(shown)
     spacing_m = stride * mosaic.m_per_px
-    x = mosaic.x_min_m + (column + 0.5) * spacing_m
-    y = mosaic.y_max_m - (row + 0.5) * spacing_m
+    points = np.zeros((len(row), 3))
+    points[:, 0] = mosaic.x_min_m + (column + 0.5) * spacing_m
+    points[:, 1] = mosaic.y_max_m - (row + 0.5) * spacing_m
     # Unseen cells are black and were averaged in: divide by the share that was seen.
-    rgb = (colour[row, column] / share[row, column, None])[:, ::-1]
+    rgb = _levels(colour[shown] / share[shown][:, None])[:, ::-1]
     none = np.zeros((0, 2), np.int64)
-    points: Floats = np.column_stack([x, y, np.zeros(len(x))]).astype(np.float64)
-    return MapPoints(points, _levels(rgb), none, np.zeros((0, 3), np.uint8)), spacing_m
+    return MapPoints(points, rgb, none, np.zeros((0, 3), np.uint8)), spacing_m
 
 
-def _thinned(picture: NDArray[np.generic], stride: int) -> NDArray[np.float32]:
-    size = (picture.shape[1] // stride, picture.shape[0] // stride)
-    mean = cv2.resize(picture.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    return np.asarray(mean, dtype=np.float32)
+def _thinned(picture: NDArray[np.uint8], stride: int) -> NDArray[np.float32]:
+    """Return the means of square groups of cells; beyond the edges all is 0."""
+    rows, columns = (math.ceil(side / stride) for side in picture.shape[:2])
+    right = columns * stride - picture.shape[1]
+    found = np.empty((rows, columns, *picture.shape[2:]), np.float32)
+    for row in range(0, rows, ROWS_AT_ONCE):
+        part = picture[row * stride : (row + ROWS_AT_ONCE) * stride]
+        below = -len(part) % stride
+        whole = cv2.copyMakeBorder(part, 0, below, 0, right, cv2.BORDER_CONSTANT, value=0)
+        size = columns, len(whole) // stride
+        mean = cv2.resize(whole.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        found[row : row + size[1]] = mean
+    return found
 
 
 def _levels(values: NDArray[np.float32]) -> Colours:

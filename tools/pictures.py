@@ -186,24 +186,29 @@ def _write_layers(
     more: Sequence[Callable[[], None]] = (),
 ) -> None:
     """Write the layers, several at a time: compressing them takes as long as a few pictures do."""
-    count = np.minimum(mosaic.count.astype(np.int64) * COUNT_GREY, 255).astype(np.uint8)
-    alpha = np.where(mosaic.count > 0, 255, 0).astype(np.uint8)  # unseen: transparent
 
     def write(suffix: str, picture: Callable[[], np.ndarray]) -> None:
         write_png(out / f"{stem}{suffix}.png", picture())
         write_atomic(out / f"{stem}{suffix}.pgw", world_file(mosaic))
 
     layers: tuple[tuple[str, Callable[[], np.ndarray]], ...] = (
-        ("", lambda: np.dstack([mosaic.floor, alpha])),
-        ("_mean", lambda: np.dstack([mosaic.mean, alpha])),
-        ("_count", lambda: count),
-        ("_few", lambda: np.where(mosaic.uncertain, 255, 0).astype(np.uint8)),
+        ("", lambda: _see_through(mosaic.floor, mosaic.count)),
+        ("_mean", lambda: _see_through(mosaic.mean, mosaic.count)),
+        ("_count", lambda: np.asarray(cv2.convertScaleAbs(mosaic.count, alpha=COUNT_GREY))),
+        ("_few", lambda: 255 * mosaic.uncertain.astype(np.uint8)),
     )
     with ThreadPoolExecutor(num_workers) as threads:
         begun = [threads.submit(work) for work in more]
         begun += [threads.submit(write, *layer) for layer in layers]
         for done in begun:
             done.result()
+
+
+def _see_through(colours: Image, count: np.ndarray) -> Image:
+    """Return BGRA that is transparent where nothing was seen."""
+    picture = np.asarray(cv2.cvtColor(colours, cv2.COLOR_BGR2BGRA), dtype=np.uint8)
+    picture[..., 3] = np.uint8(255) * (count > 0).view(np.uint8)
+    return picture
 
 
 def world_file(mosaic: Mosaic) -> str:
