@@ -102,7 +102,8 @@ def estimate_exposure(samples: Samples, lens_of_view: Numbers) -> Exposure:
     shared = seen[cell] > 1
     if not shared.any():
         return neutral_exposure(num_views)
-    order = np.flatnonzero(shared)[np.argsort(cell[shared], kind="stable")]
+    by_cell_and_view = cell[shared] * num_views + samples.view[shared]
+    order = np.flatnonzero(shared)[np.argsort(by_cell_and_view, kind="stable")]
     view, begins = samples.view[order], np.append(0, np.cumsum(seen[seen > 1]))
     values = np.log(np.maximum(samples.colour[order], 1.0))
     floor = _Floor(view, lens_of_view[view], samples.radius2[order], values, begins)
@@ -112,7 +113,7 @@ def estimate_exposure(samples: Samples, lens_of_view: Numbers) -> Exposure:
 
 
 class _Floor(NamedTuple):
-    """Samples in order of their cells.
+    """Samples in order of their cells, and of the views in a cell.
 
     Attributes:
         view: (n,) number of the picture.
@@ -164,7 +165,9 @@ def _solve(floor: _Floor, weight: Floats, num_views: int, num_lenses: int) -> tu
     prior[:num_views] = GAIN_PRIOR * np.maximum(samples, 1.0)
     normal += np.diag(prior)
     gains, both = slice(0, num_views), normal[:num_views, num_views:]
-    solved = splu(sparse.csc_array(normal[gains, gains])).solve
+    block = sparse.csc_array(normal[gains, gains])  # positive definite: it needs no pivots
+    symmetric = {"SymmetricMode": True}
+    solved = splu(block, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric).solve
     # Block elimination: the falloff of the mean channel first.
     of_falloff = normal[num_views:, num_views:] - both.T @ solved(both)
     mean = right.mean(axis=1)
@@ -175,9 +178,9 @@ def _solve(floor: _Floor, weight: Floats, num_views: int, num_lenses: int) -> tu
 
 def _noise(floor: _Floor, point: Floats, gain: Floats, falloff: Floats) -> float:
     """Standard deviation of one view of a cell: from differences between two views of it."""
-    powers = floor.radius2[:, None] ** np.arange(1, POWERS + 1)
-    fall = (falloff[floor.lens] * powers).sum(axis=1)
-    even = point * np.exp(-fall[:, None] - gain[floor.view])
+    c1, c2, c3 = falloff.T[:, floor.lens]
+    fall = floor.radius2 * (c1 + floor.radius2 * (c2 + floor.radius2 * c3))
+    even = point * np.exp(-fall)[:, None] * np.exp(-gain)[floor.view]
     difference = np.abs(np.diff(even, axis=0))
     across = floor.begins[1:-1] - 1  # from the last view of a cell to the first of the next
     difference = np.delete(difference, across, axis=0)

@@ -4,13 +4,13 @@ from typing import Any
 
 import numpy as np
 
-from groundfuse.backend.compiled import compiled
+from groundfuse.backend.compiled import compiled, part
 
 POWERS = 3
 CHANNELS = 3
 
 
-@compiled
+@part
 def _mean(weight: Any, values: Any, ends: tuple[int, int]) -> Any:  # noqa: ANN401
     """Return the weights' sum and the values' weighted means."""
     whole, blue, green, red = 0.0, 0.0, 0.0, 0.0
@@ -22,9 +22,9 @@ def _mean(weight: Any, values: Any, ends: tuple[int, int]) -> Any:  # noqa: ANN4
     return whole, (blue / whole, green / whole, red / whole)
 
 
-@compiled
+@part
 def _add_sample(
-    place: tuple[int, int],
+    place: tuple[int, int, int],
     weighted: tuple[float, float],
     rest: tuple[float, float, float],
     total: Any,  # noqa: ANN401
@@ -32,24 +32,25 @@ def _add_sample(
 ) -> None:
     """Add w a a' of one sample, a times its weighted rest, and the powers' part of w a."""
     normal, right = equations
-    (view, lens), (w, radius2) = place, weighted
-    normal[view, view] += w
+    (view, first, lens), (w, radius2) = place, weighted
+    of_view = normal[view]
+    of_view[view] += w
     for channel in range(CHANNELS):
         right[view, channel] += rest[channel]
     product = 1.0
     for i in range(POWERS):
         product *= radius2
-        total[i] += w * product
-        normal[view, lens + i] += w * product
-        both = w * product * product
+        total[lens + i] += w * product
+        of_view[first + lens + i] += w * product
+        both, of_power = w * product * product, normal[first + lens + i]
         for j in range(i, POWERS):
-            normal[lens + i, lens + j] += both
+            of_power[first + lens + j] += both
             both *= radius2
         for channel in range(CHANNELS):
-            right[lens + i, channel] += product * rest[channel]
+            right[first + lens + i, channel] += product * rest[channel]
 
 
-@compiled
+@part
 def _take_cell(
     view: Any,  # noqa: ANN401 - arrays, typed when compiled
     weight: Any,  # noqa: ANN401
@@ -61,15 +62,15 @@ def _take_cell(
     whole, total = sums
     first = len(normal) - len(total)
     for k in range(ends[0], ends[1]):
-        share, a = weight[k] / whole, view[k]
-        for other in range(ends[0], ends[1]):
-            if view[other] >= a:
-                normal[a, view[other]] -= share * weight[other]
+        row, share = normal[view[k]], weight[k] / whole
+        for other in range(k, ends[1]):
+            row[view[other]] -= share * weight[other]
         for i in range(len(total)):
-            normal[a, first + i] -= share * total[i]
+            row[first + i] -= share * total[i]
     for i in range(len(total)):
+        row, share = normal[first + i], total[i] / whole
         for j in range(i, len(total)):
-            normal[first + i, first + j] -= total[i] * total[j] / whole
+            row[first + j] -= share * total[j]
 
 
 @compiled
@@ -87,7 +88,8 @@ def add_normal(
     view, and then one for each power of r^2 of each lens.
 
     Args:
-        seen: samples in order of their cells: views (n,), lenses (n,), r^2 (n,), values (n, 3).
+        seen: samples in order of their cells, and of the views in a cell: views (n,), lenses (n,),
+            r^2 (n,), values (n, 3).
         begins: (cells + 1,) first sample of each cell, and the number of samples.
         weight: (n,) of the samples.
         first: column of the first lens.
@@ -108,8 +110,7 @@ def add_normal(
                 w * (values[k, 1] - mean[1]),
                 w * (values[k, 2] - mean[2]),
             )
-            place = view[k], first + b
-            _add_sample(place, (w, radius2[k]), rest, total[b : b + POWERS], equations)
+            _add_sample((view[k], first, b), (w, radius2[k]), rest, total, equations)
         _take_cell(view, weight, ends, (whole, total), normal)
 
 

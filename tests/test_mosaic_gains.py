@@ -88,6 +88,19 @@ def test_the_solution_is_that_of_least_squares_with_every_cells_colour():
     np.testing.assert_allclose(gain, each[:VIEWS], rtol=0.0, atol=1e-9)
 
 
+def test_the_order_of_the_samples_does_not_matter():
+    rng = np.random.default_rng(10)
+    samples = made_samples(rng, rng.normal(0, 0.2, (VIEWS, 3)), rng.normal(0, 0.2, (2, 3)))
+    order = rng.permutation(len(samples.cell))
+    parts = (samples.cell, samples.view, samples.radius2, samples.colour, samples.point)
+    mixed = Samples(*(part[order] for part in parts))
+    lens_of_view = np.arange(VIEWS) % 2
+    expected, found = (estimate_exposure(each, lens_of_view) for each in (samples, mixed))
+    np.testing.assert_array_equal(found.log_gain, expected.log_gain)
+    np.testing.assert_array_equal(found.falloff, expected.falloff)
+    assert found.noise_levels == expected.noise_levels
+
+
 def test_distances_are_from_the_weighted_mean_of_a_cell():
     rng = np.random.default_rng(9)
     view, lens = np.arange(20) % 5, np.arange(20) % 5 % 2
