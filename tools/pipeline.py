@@ -89,7 +89,6 @@ class Means:
     """What a run works with: who, with what is known already, and who is told about it."""
 
     workers: Workers
-    num_threads: int
     store: Store
     progress: Progress
     watch: Stopwatch
@@ -170,8 +169,7 @@ def fuse_robots(
         DataError: a picture can't be read, or the store can't be written.
     """
     robots = tuple(robots)
-    who = workers or Threads(num_workers)
-    means = Means(who, num_workers, store or Store(), progress, watch)
+    means = Means(workers or Threads(num_workers), store or Store(), progress, watch)
     fused = _looked(robots, robots, (), options, means, bundled=bundled)
     assumed: Sequence[MountEstimate] = ()
     for _ in range(options.more_looks):
@@ -220,7 +218,7 @@ def _looked(
                 desk = Desk(
                     found.pictures,
                     store,
-                    means.num_threads,
+                    means.workers.num_threads,
                     means.progress,
                     options.bundle.most_sightings,
                 )
