@@ -4,9 +4,11 @@
 
 One robot drives over terrazzo; the first n pictures are given to both, one run each. The stitcher
 expects pictures of something flat from straight above, so it gets the overhead views at each
-picture's filed attitude, with their masks; making them is not counted. Positions of the camera's
-foot are compared with the truth after the best similarity (the stitcher knows no scale), over the
-pictures that each of them kept. Run it on an otherwise idle machine.
+picture's filed attitude, with their masks; making them is not counted. Both make a picture with
+cells of the same size, that of the overhead views (with `--own-cell`, the main job makes the finer
+one that it makes by itself). Positions of the camera's foot are compared with the truth after the
+best similarity (the stitcher knows no scale), over the pictures that each of them kept. Run it on
+an otherwise idle machine.
 """
 
 import argparse
@@ -54,12 +56,14 @@ class Result:
     error_m: float
 
 
-def of_groundfuse(folder: Path, robot: Robot) -> Result:
-    """Run the main job, mosaic and all."""
+def of_groundfuse(folder: Path, robot: Robot, cell_m: float | None) -> Result:
+    """Run the main job, mosaic and all; with no cell asked for, with its own."""
     out = folder.with_name(f"{folder.name}_out")
+    words = ["--team", str(folder), "--out", str(out), "--quiet"]
+    words += [] if cell_m is None else ["--cell", str(cell_m)]
     begin, begin_cpu = time.perf_counter(), time.process_time()
     with contextlib.redirect_stdout(io.StringIO()):
-        code = fuse_team.main(["--team", str(folder), "--out", str(out), "--quiet"])
+        code = fuse_team.main(words)
     seconds, cpu_s = time.perf_counter() - begin, time.process_time() - begin_cpu
     if code != 0:
         raise TeamError(f"the main job ended with {code}")
@@ -137,7 +141,7 @@ def first_pictures(team: Path, number: int, folder: Path) -> Path:
     return target.parent
 
 
-def compare(sizes: Sequence[int], seed: int, folder: Path) -> None:
+def compare(sizes: Sequence[int], seed: int, folder: Path, *, own_cell: bool) -> None:
     """Print one line for each number of pictures."""
     team, most = folder / "team", max(sizes)
     words = ["--out", str(team), "--robots", f"{ROBOT}:33", "--views", str(most)]
@@ -149,7 +153,9 @@ def compare(sizes: Sequence[int], seed: int, folder: Path) -> None:
     for number in sizes:
         part = first_pictures(team, number, folder)
         (robot,) = read_team(part, [ROBOT])
-        ours, theirs = of_groundfuse(part, robot), of_stitcher(robot)
+        overhead = overhead_grid(robot.camera, robot.frames[0].attitude)
+        cell_m = None if own_cell else overhead.m_per_px
+        ours, theirs = of_groundfuse(part, robot, cell_m), of_stitcher(robot)
         columns = [
             f"{r.seconds:8.1f}{r.cpu_s:8.1f}{r.kept:8d}{1e3 * r.error_m:12.2f}"
             for r in (ours, theirs)
@@ -165,10 +171,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     command.add_argument("--sizes", nargs="+", type=int, default=[10, 25, 50, 100])
     command.add_argument("--seed", type=int, default=300)
+    command.add_argument("--own-cell", action="store_true", help="the main job's own, finer mosaic")
     asked = command.parse_args(arguments)
     try:
         with tempfile.TemporaryDirectory() as folder:
-            compare(asked.sizes, asked.seed, Path(folder))
+            compare(asked.sizes, asked.seed, Path(folder), own_cell=asked.own_cell)
     except TeamError as error:
         print(f"bench_stitcher.py: {error}", file=sys.stderr)
         return 2
