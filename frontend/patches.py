@@ -23,6 +23,10 @@ from groundfuse.frontend.patches_compiled import fill_templates, lay_on
 from groundfuse.frontend.sight import cam_from_team
 
 Integers = NDArray[np.int64]
+MOST_HALVINGS = 3
+"""A picture eight times as fine as another is read from its last halving."""
+LATER = 0.25
+"""A picture is halved where it is 1.7 times as fine as the other, not 1.4: reading blurs, too."""
 SPREAD = 0.5
 """Deviation of the places of a patch, weighted as they are, in radii."""
 
@@ -136,6 +140,7 @@ class PatchPlan:
         finest_view: (m,) number of the finest's view.
         finest_place: (m, 2) the finest, px.
         map: (m, 3, 3) from pixels off a keypoint to pixels off its finest, homogeneous.
+        halvings: (m,) of the finest's picture that leave it about as fine as the keypoint's own.
     """
 
     views: Sequence[PatchView]
@@ -146,6 +151,7 @@ class PatchPlan:
     finest_view: Integers
     finest_place: Points
     map: Floats
+    halvings: Integers
 
 
 def patch_plan(
@@ -163,8 +169,9 @@ def patch_plan(
     view, rays, there = known.view[which], known.rays[which], known.view[finest]
     spread_px = np.full(len(which), SPREAD * options.radius_px)
     lens = _through_lenses(views, view, rays, spread_px)
-    larger_px = spread_px * np.sqrt(known.fineness[finest] / known.fineness[which])
-    other = _through_lenses(views, there, known.rays[finest], larger_px)
+    times = np.sqrt(known.fineness[finest] / known.fineness[which])
+    halvings = np.clip(np.round(np.log2(times) - LATER), 0, MOST_HALVINGS).astype(np.int64)
+    other = _through_lenses(views, there, known.rays[finest], spread_px * times)
     ray_by_px = _inverse(lens.by_ray)
     from_px = _affine(ray_by_px, rays - _times(ray_by_px, lens.bend))
     eye = np.broadcast_to(np.eye(2), ray_by_px.shape)
@@ -172,7 +179,9 @@ def patch_plan(
     to_px = _affine(other.by_ray, other.bend - _times(other.by_ray, known.rays[finest]))
     floor_from_cam = np.linalg.inv(cam_from_floor)
     carried = to_px @ cam_from_floor[there] @ shift @ floor_from_cam[view] @ from_px
-    return PatchPlan(views, view, rays, lens.place, ray_by_px, there, other.place, carried)
+    return PatchPlan(
+        views, view, rays, lens.place, ray_by_px, there, other.place, carried, halvings
+    )
 
 
 def _cams_from_floor(views: Sequence[PatchView]) -> Floats:
@@ -259,10 +268,29 @@ class Aligned:
         return np.isfinite(self.sigma)
 
 
-def grey_picture(view: PatchView, options: PatchOptions) -> Image:
-    """Load a view's picture, grey and smooth."""
+@dataclass(frozen=True, slots=True, eq=False)
+class GreyPicture:
+    """A picture, grey and smooth, and its halvings; halving a place gives its place in each.
+
+    Attributes:
+        levels: the picture, half of it, and so on.
+    """
+
+    levels: tuple[Image, ...]
+
+    @property
+    def nbytes(self) -> int:
+        """Memory held."""
+        return sum(level.nbytes for level in self.levels)
+
+
+def grey_picture(view: PatchView, options: PatchOptions) -> GreyPicture:
+    """Load a view's picture."""
     grey = cv2.cvtColor(view.load(), cv2.COLOR_BGR2GRAY)
-    return np.asarray(cv2.GaussianBlur(grey, (0, 0), options.blur_px), dtype=np.uint8)
+    levels = [np.asarray(cv2.GaussianBlur(grey, (0, 0), options.blur_px), dtype=np.uint8)]
+    while len(levels) <= MOST_HALVINGS:
+        levels.append(np.asarray(cv2.pyrDown(levels[-1]), dtype=np.uint8))
+    return GreyPicture(tuple(levels))
 
 
 def empty_templates(count: int, options: PatchOptions) -> Picture32:
@@ -271,7 +299,7 @@ def empty_templates(count: int, options: PatchOptions) -> Picture32:
     return np.zeros((count, side, side), np.float32)
 
 
-def fill_from(plan: PatchPlan, which: Integers, picture: Image, templates: Picture32) -> None:
+def fill_from(plan: PatchPlan, which: Integers, picture: GreyPicture, templates: Picture32) -> None:
     """Read patches from the view that their finest are in.
 
     Args:
@@ -280,12 +308,22 @@ def fill_from(plan: PatchPlan, which: Integers, picture: Image, templates: Pictu
         picture: that view's; see `grey_picture`.
         templates: (m, ...) of the plan's keypoints, to fill.
     """
-    rows = plan.views[int(plan.finest_view[which[0]])].camera.used_rows
-    fill_templates(picture, rows, which, plan.finest_place[which], plan.map[which], templates)
+    rows = np.array(plan.views[int(plan.finest_view[which[0]])].camera.used_rows)
+    for level, halved in enumerate(picture.levels):
+        some = which[plan.halvings[which] == level]
+        share = 0.5**level
+        first, last = np.ceil(rows[0] * share), np.floor(rows[1] * share)
+        maps = plan.map[some] * np.array([share, share, 1.0])[:, None]
+        middle = plan.finest_place[some] * share
+        fill_templates(halved, (int(first), int(last)), some, middle, maps, templates)
 
 
 def aligned(
-    plan: PatchPlan, which: Integers, picture: Image, templates: Picture32, options: PatchOptions
+    plan: PatchPlan,
+    which: Integers,
+    picture: GreyPicture,
+    templates: Picture32,
+    options: PatchOptions,
 ) -> Aligned:
     """Align keypoints of one view to their finest.
 
@@ -300,7 +338,7 @@ def aligned(
     rows = plan.views[int(plan.view[which[0]])].camera.used_rows
     most = options.steps, options.max_move_px
     weight = _weight(2 * options.radius_px + 1)
-    lay_on(picture, rows, begin, templates[which], weight, most, found)
+    lay_on(picture.levels[0], rows, begin, templates[which], weight, most, found)
     return _judged(found, begin, plan.ray_by_px[which], plan.rays[which], options)
 
 

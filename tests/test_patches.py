@@ -9,6 +9,7 @@ import pytest
 from analytic_floor import floor_of_pixels, make_camera, picture, rounded, waves
 
 from groundfuse.backend.measurement import Attitude, Se2
+from groundfuse.frontend import patches
 from groundfuse.frontend.overhead import floor_from_rays, rays_from_floor
 from groundfuse.frontend.patches import (
     PatchOptions,
@@ -32,10 +33,9 @@ WAVE_M = 0.045
 EXACT_PX = 0.04
 
 
-def attitude_of(number):
+def attitude_of(number, expected):
     """The wobble of the pictures, which the alignment is not told of."""
     tilt, roll, height = np.random.default_rng(number).standard_normal(3).tolist()
-    expected = make_camera().mount.attitude
     return Attitude(
         expected.tilt_rad + math.radians(0.5 * tilt),
         math.radians(0.15 * roll),
@@ -56,17 +56,18 @@ def as_it_is(_, image):
 class World:
     """Pictures of floor points, with their true pixels and rays."""
 
-    def __init__(self, coefficients=(), change=as_it_is, count=60):
+    def __init__(self, coefficients=(), change=as_it_is, count=60, heights_m=(0.55, 0.55, 0.55)):
         self.camera = make_camera(coefficients=coefficients, size=(240, 180))
-        self.attitudes = [attitude_of(k) for k in range(len(POSES))]
+        tilted = self.camera.mount.attitude
+        known = [replace(tilted, height_m=height_m) for height_m in heights_m]
+        self.attitudes = [attitude_of(k, expected) for k, expected in enumerate(known)]
         images = [
             rounded(change(k, picture(self.camera, attitude, pose, colour)))
             for k, (attitude, pose) in enumerate(zip(self.attitudes, POSES, strict=True))
         ]
-        known = self.camera.mount.attitude
         self.views = [
-            PatchView(self.camera, known, pose, lambda image=image: image)
-            for pose, image in zip(POSES, images, strict=True)
+            PatchView(self.camera, attitude, pose, lambda image=image: image)
+            for attitude, pose, image in zip(known, POSES, images, strict=True)
         ]
         self.pictures = [grey_picture(view, OPTIONS) for view in self.views]
         self._place(count)
@@ -135,6 +136,20 @@ def test_keypoints_come_back_to_where_they_are(world):
     error = np.hypot(*errors[np.isfinite(sigmas)].T)
     assert np.quantile(error, 0.9) < EXACT_PX
     assert np.median(error) < 0.5 * EXACT_PX
+
+
+def test_a_much_finer_picture_is_halved_first(monkeypatch):
+    """One camera hangs at 0.4 of the others' height: read at every third pixel, it shimmers."""
+    near = World(heights_m=(0.55, 0.22, 0.55), count=25)
+    rays, _ = near.seen(0.5)
+    _, errors, _ = near.aligned(rays)
+    assert np.isfinite(errors).mean() > 0.65  # others reach over the border: three times as far
+    assert np.nanmedian(np.hypot(*errors.T)) < EXACT_PX
+    which, plan = near.plan(rays)
+    assert 0 < np.count_nonzero(plan.halvings == 1) < len(which)
+    monkeypatch.setattr(patches, "MOST_HALVINGS", 0)
+    _, plain, _ = near.aligned(rays)
+    assert np.nanmedian(np.hypot(*errors.T)) < np.nanmedian(np.hypot(*plain.T))
 
 
 def test_few_steps_are_enough(world):

@@ -28,6 +28,7 @@ from groundfuse.backend.measurement import (
 from groundfuse.frontend.arrays import Image
 from groundfuse.frontend.patches import (
     Aligned,
+    GreyPicture,
     Integers,
     Keypoints,
     PatchOptions,
@@ -204,7 +205,7 @@ def _align(
     finest, and are then laid on, view by view of their own: however far apart two views of a place
     were taken, few pictures are read more than once.
     """
-    pictures: Cache[Image] = Cache(
+    pictures: Cache[GreyPicture] = Cache(
         lambda number: grey_picture(views[number], options), options.cache_bytes
     )
     most = max(1, options.cache_bytes // empty_templates(1, options).nbytes)
@@ -224,7 +225,7 @@ def _align(
 def _align_part(
     plan: PatchPlan,
     found: Array,
-    picture: Callable[[int], Image],
+    picture: Callable[[int], GreyPicture],
     options: PatchOptions,
     num_threads: int,
 ) -> Iterator[None]:
