@@ -71,7 +71,8 @@ def exp(tangent: Array) -> Array:
     small = np.abs(theta) < SMALL_RAD
     safe = np.where(small, 1.0, theta)
     sine = np.where(small, 1.0 - theta**2 / 6.0, np.sin(safe) / safe)
-    versine = np.where(small, theta / 2.0 - theta**3 / 24.0, (1.0 - np.cos(safe)) / safe)
+    # 1 - cos as twice the square of a sine: the difference would keep half of the digits.
+    versine = np.where(small, theta / 2.0 - theta**3 / 24.0, 2.0 * np.sin(safe / 2.0) ** 2 / safe)
     moved = np.stack([sine * x - versine * y, versine * x + sine * y], axis=-1)
     return _joined(moved, theta)
 

@@ -114,7 +114,7 @@ def keypoints_of(
         rays: (n, 2) of the keypoints, without distortion.
         point: (n,) floor point of each, numbered from 0, none left out.
     """
-    cam_from_floor = _cams_from_floor(views)
+    cam_from_floor = _cam_from_floor(views)
     on_floor = (np.linalg.inv(cam_from_floor)[view] @ _homogeneous(rays)[:, :, None])[:, :, 0]
     floor = on_floor[:, :2] / on_floor[:, 2:]
     # A homography's area grows with its determinant over depth cubed; the lens adds its own.
@@ -165,7 +165,7 @@ def patch_plan(
         which: (m,) numbers of those that are to be aligned.
         options: see there.
     """
-    cam_from_floor, finest = _cams_from_floor(views), known.finest[which]
+    cam_from_floor, finest = _cam_from_floor(views), known.finest[which]
     view, rays, there = known.view[which], known.rays[which], known.view[finest]
     spread_px = np.full(len(which), SPREAD * options.radius_px)
     lens = _through_lenses(views, view, rays, spread_px)
@@ -184,7 +184,7 @@ def patch_plan(
     )
 
 
-def _cams_from_floor(views: Sequence[PatchView]) -> Floats:
+def _cam_from_floor(views: Sequence[PatchView]) -> Floats:
     return np.stack([cam_from_team(v.attitude, v.team_from_foot) for v in views])
 
 

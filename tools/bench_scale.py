@@ -27,7 +27,7 @@ from groundfuse.tools.bench_scale_runs import Growth, grown, matching_s, recalls
 from groundfuse.tools.errors import TeamError
 from groundfuse.tools.front_end_options import Matcher
 
-STAGES = ("features", "retrieval", "pairs", "graphs", "bundle", "mosaic")
+STAGES = ("features", "retrieval", "pairs", "graphs", "patches", "bundle", "mosaic")
 
 
 def exponent(frames: Sequence[int], seconds: Sequence[float]) -> float:
