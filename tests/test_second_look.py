@@ -63,7 +63,7 @@ def test_only_used_numbers_correct():
         ({"height": 0.0015}, False),  # and of the height 0.002
         ({"height": 0.0025}, True),
         ({"focal": 5e-5}, False),
-        ({"focal": -2e-4}, True),
+        ({"focal": -4e-4}, True),
     ],
 )
 def test_a_look_is_worth_what_has_cost_pairs(tmp_path, numbers, worth):
@@ -76,7 +76,7 @@ def test_a_look_is_worth_what_has_cost_pairs(tmp_path, numbers, worth):
 
 def test_a_lens_that_is_known_very_well_is_not_worth_a_look_for_next_to_nothing(tmp_path):
     team = robots(tmp_path)
-    for off, worth in ((5e-5, False), (-2e-4, True)):
+    for off, worth in ((2e-4, False), (-4e-4, True)):
         focal = Estimated(off, 1e-6, 0.003, used=True)
         mounts = [replace(found("B"), focal=focal)]
         assert is_worth_it(team, (), mounts) == worth

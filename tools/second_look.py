@@ -26,8 +26,8 @@ WORTH_WOBBLE = 0.5
 """A mount this far off, in its pictures' own wobble, is worth another look."""
 WORTH_SIGMA = 1.0
 """A lens is, where this much of its own sigma is still wrong,"""
-WORTH_LENS = 1e-4
-"""and this much of its focal length: 0.03 px far out, a tenth of a keypoint's error."""
+WORTH_LENS = 3e-4
+"""and this much of its focal length: 0.1 px far out, a third of a keypoint's error in a pair."""
 
 
 def is_worth_it(
