@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from groundfuse.backend.measurement import Attitude, Se2
 from groundfuse.backend.option_checks import check_numbers
-from groundfuse.frontend.arrays import Floats, Image, Mask, Picture32, Points
+from groundfuse.frontend.arrays import Floats, Image, Picture32, Points
 from groundfuse.frontend.camera import Camera, Intrinsics
 from groundfuse.frontend.patches_compiled import fill_templates, lay_on
 from groundfuse.frontend.sight import cam_from_team
@@ -256,16 +256,11 @@ class Aligned:
 
     Attributes:
         rays: (n, 2) where they are now; nan where they do not fit.
-        sigma: (n,) one-axis standard deviation of `rays`.
+        sigma: (n,) one-axis standard deviation of `rays`; nan likewise.
     """
 
     rays: Points
     sigma: Floats
-
-    @property
-    def fits(self) -> Mask:
-        """(n,) which of them fit."""
-        return np.isfinite(self.sigma)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

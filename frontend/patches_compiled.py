@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from groundfuse.backend.compiled import compiled
+from groundfuse.backend.compiled import compiled, part
 
 STEP_PX = 0.002
 """A patch that moves by less has come to rest: a tenth of what it can be known to."""
@@ -13,15 +13,20 @@ FAINTEST = 1.0
 """Least deviation of grey values in a patch, levels: below it is the camera's own noise."""
 
 
-@compiled
-def read_between(picture: Any, u: Any, v: Any) -> Any:  # noqa: ANN401 - arrays, typed when compiled
-    """Return the grey value (bilinear) at a place between the picture's pixels."""
-    x, y = np.int64(u), np.int64(v)
-    right, down = np.float32(u - x), np.float32(v - y)
+@part
+def _between(picture: Any, x: Any, y: Any, right: Any, down: Any) -> Any:  # noqa: ANN401
+    """Return the grey value (bilinear) so far right of and below a pixel."""
     upper, lower = np.float32(picture[y, x]), np.float32(picture[y + 1, x])
     upper += right * (np.float32(picture[y, x + 1]) - upper)
     lower += right * (np.float32(picture[y + 1, x + 1]) - lower)
     return upper + down * (lower - upper)
+
+
+@compiled
+def read_between(picture: Any, u: Any, v: Any) -> Any:  # noqa: ANN401 - arrays, typed when compiled
+    """Return the grey value (bilinear) at a place between the picture's pixels."""
+    x, y = np.int64(u), np.int64(v)
+    return _between(picture, x, y, np.float32(u - x), np.float32(v - y))
 
 
 @compiled
@@ -119,11 +124,7 @@ def _read_patch(picture: Any, rows: tuple[int, int], u: float, v: float, patch: 
     right, down = np.float32(u - np.int64(u)), np.float32(v - np.int64(v))
     for i in range(patch.shape[0]):
         for j in range(patch.shape[1]):
-            upper = np.float32(picture[y + i, x + j])
-            lower = np.float32(picture[y + i + 1, x + j])
-            upper += right * (np.float32(picture[y + i, x + j + 1]) - upper)
-            lower += right * (np.float32(picture[y + i + 1, x + j + 1]) - lower)
-            patch[i, j] = upper + down * (lower - upper)
+            patch[i, j] = _between(picture, x + j, y + i, right, down)
     return True
 
 
