@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from painted_team import HEIGHT_M, PAIR, QUICK, SIGMA, painted_pair
+from painted_team import HEIGHT_M, PAIR, QUICK, SIGMA, painted_pair, silent
 
 from groundfuse.backend.bundle_tracks import sightings_from_edges
 from groundfuse.backend.measurement import Attitude, FrameId, RelativePose, Se2
@@ -21,10 +21,6 @@ from groundfuse.tools.team_folder import read_team
 from groundfuse.tools.team_graphs import accepted_edges
 
 OPTIONS = PatchOptions()
-
-
-def silent(items, _total, _title):
-    return items
 
 
 @pytest.fixture(scope="module")

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from floor_pairs import camera, drawn, error_of, nees, photo, true_motion
+from painted_team import silent
 from scipy import stats
 
 from groundfuse.backend.measurement import (
@@ -76,10 +77,6 @@ def robot(name, folder=Path(), count=None, odometry=None):
         for k in range(count or len(PATHS[name]))
     )
     return Robot(name, cam, frames)
-
-
-def silent(items, total, title):  # noqa: ARG001
-    return items
 
 
 def run(robots, *, options=OPTIONS, workers=1, progress=silent, store=None):

@@ -18,7 +18,7 @@ from fused_world import (
     robots_of,
     world,
 )
-from painted_team import PAIR, QUICK, SIGMA, painted_pair
+from painted_team import PAIR, QUICK, SIGMA, painted_pair, silent
 
 from groundfuse.backend.bundle_estimate import BundleEstimate, BundleRefusal, Illposed
 from groundfuse.backend.drift import accuracy
@@ -42,10 +42,6 @@ PAINTED_TILT_RAD = math.radians(0.19)
 @pytest.fixture
 def truth():
     return world()
-
-
-def silent(items, _total, _title):
-    return items
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from painted_team import QUICK, painted_pair
+from painted_team import QUICK, painted_pair, silent
 
 from groundfuse.backend.bundle_estimate import Estimated, MountEstimate
 from groundfuse.backend.drift import accuracy
@@ -123,10 +123,6 @@ def test_equal_rays_stay_equal(tmp_path):
     edges = [RelativePose(A, B, Se2(0, 0, 0), np.eye(3), 9, 0.1, p) for p in (whole, part)]
     one, other = as_filed(edges, robots(tmp_path), mounts)
     np.testing.assert_array_equal(one.correspondences.rays_a[5:16], other.correspondences.rays_a)
-
-
-def silent(items, _total, _title):
-    return items
 
 
 def test_a_wrong_mount_costs_pairs_only_at_the_first_look():

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import pytest
-from painted_team import QUICK, painted_pair
+from painted_team import QUICK, painted_pair, silent
 
 from groundfuse.backend.bundle_estimate import BundleEstimate
 from groundfuse.tools import team_graphs
@@ -15,10 +15,6 @@ from groundfuse.tools.team_folder import read_team
 
 # Either answer may lie a fifth of a sigma from the optimum, see `bundle.SETTLED`.
 TOLERANCE_SIGMA = 0.5
-
-
-def silent(items, _total, _title):
-    return items
 
 
 def fused(robots, store):
