@@ -9,6 +9,7 @@ tracks, and the second stage solves for all of them.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 
@@ -46,9 +47,10 @@ from groundfuse.backend.bundle_solve import Problem, Solution, minimise, problem
 from groundfuse.backend.bundle_tracks import (
     Integers,
     Links,
+    Matched,
     Sightings,
+    matched,
     observations,
-    sightings_from_edges,
     single_links,
     tracks,
     with_gains,
@@ -102,6 +104,7 @@ def bundle(
     cameras: Mapping[str, BundleCamera],
     options: BundleOptions = DEFAULT,
     earlier: BundleEstimate | None = None,
+    seen: Matched | None = None,
 ) -> BundleEstimate | BundleRefusal:
     """Refine the team's poses and find every frame's attitude and every robot's mount.
 
@@ -115,22 +118,22 @@ def bundle(
         options: see there.
         earlier: what a bundle of most of these frames found, with the same files and options; it
             saves time where it fits, see `bundle_again`.
+        seen: the correspondences of `edges` where these have better ones elsewhere; frames are
+            numbered in their order, edges as here.
 
     Raises:
         ValueError: a frame has no prior, or a sigma or height is not positive.
     """
     team = team_of(start)
-    used = [
-        edge
-        for edge in edges
-        if start.component_of.get(edge.a, -1) == start.component_of.get(edge.b, -2)
-    ]
+    home = start.component_of
+    inside = np.array([home.get(e.a, -1) == home.get(e.b, -2) for e in edges], dtype=np.bool_)
+    used = list(compress(edges, inside))
     priors = priors_of(team, prior, sigma, options)
-    sightings, links = sightings_from_edges(used, team.index_of)
+    seen = matched(used, team.index_of) if seen is None else seen.only_edges(inside)
     tables = [cameras[name].focal_gains for name in team.robots]
-    sightings = with_gains(sightings, team.robot_of, tables)
+    sightings = with_gains(seen.sightings, team.robot_of, tables)
     state = start_state(team, start, priors, cameras)
-    job = Job(team, cameras, sightings, links, used, options)
+    job = Job(team, cameras, sightings, seen.links, used, options)
     warm = None if earlier is None else going_on(earlier, start, team, priors, cameras)
     try:
         if earlier is not None and warm is not None:
@@ -140,7 +143,7 @@ def bundle(
         found = _solved(job, priors, state)
     except NotPositiveDefiniteError:
         text = "the correspondences leave a pose or an attitude undetermined"
-        return BundleRefusal(Illposed.SINGULAR, float(len(links)), float(len(links)), text)
+        return BundleRefusal(Illposed.SINGULAR, float(len(job.links)), float(len(job.links)), text)
     if isinstance(found, BundleRefusal):
         return found
     return report(Ends(start, team, cameras, options, len(team.frames)), *found)

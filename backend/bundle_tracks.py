@@ -66,6 +66,24 @@ class Links:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Matched:
+    """The correspondences of edges: keypoints, each of them once, and which of them are linked.
+
+    Attributes:
+        sightings: keypoints; some may have no link.
+        links: sorted by edge.
+    """
+
+    sightings: Sightings
+    links: Links
+
+    def only_edges(self, kept: Mask) -> "Matched":
+        """Return the correspondences of some of the edges, which are numbered anew."""
+        links, number = self.links.only(kept[self.links.edge]), np.cumsum(kept) - 1
+        return Matched(self.sightings, Links(links.a, links.b, number[links.edge]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Observations:
     """Sightings of floor points, sorted by frame; and all pairs of sightings of the same point.
 
@@ -108,23 +126,22 @@ def mixed_keys(number: Integers, ray: Array) -> Keys:
     return mixed
 
 
-def sightings_from_edges(
-    edges: Sequence[RelativePose], index_of: Mapping[FrameId, int]
-) -> tuple[Sightings, Links]:
+def matched(edges: Sequence[RelativePose], index_of: Mapping[FrameId, int]) -> Matched:
     """Collect the correspondences of all edges; a keypoint of several edges is one sighting."""
     frames, rays, sigmas, counts = [], [], [], []
     for edge in edges:
         pair = edge.correspondences
         counts.append(0 if pair is None else len(pair))
         if pair is not None:
-            frames += [np.full(len(pair), index_of[edge.a]), np.full(len(pair), index_of[edge.b])]
+            frames += [index_of[edge.a], index_of[edge.b]]
             rays += [pair.rays_a, pair.rays_b]
             sigmas += [pair.sigma_a, pair.sigma_b]
     if sum(counts) == 0:
         none = np.zeros(0, dtype=np.int64)
-        return Sightings(none, np.zeros((0, 2)), np.zeros(0)), Links(none, none, none)
-    frame, ray, sigma = np.concatenate(frames), np.concatenate(rays), np.concatenate(sigmas)
-    _, first, which = np.unique(mixed_keys(frame, ray), return_index=True, return_inverse=True)
+        return Matched(Sightings(none, np.zeros((0, 2)), np.zeros(0)), Links(none, none, none))
+    ray, sigma = np.concatenate(rays), np.concatenate(sigmas)
+    frame = np.repeat(np.array(frames), [len(part) for part in sigmas])
+    first, which = _each_once(mixed_keys(frame, ray))
     # The start of each pair's two runs: a comes first, b follows.
     size = np.array(counts)
     edge_of = np.repeat(np.arange(len(edges)), size)
@@ -133,7 +150,20 @@ def sightings_from_edges(
     links = Links(which[start + within], which[start + size[edge_of] + within], edge_of)
     # Every pair has an estimate of its own of how noisy its keypoints are.
     mean_square = np.bincount(which, sigma**2) / np.bincount(which)
-    return Sightings(frame[first], ray[first], np.sqrt(mean_square)), links
+    return Matched(Sightings(frame[first], ray[first], np.sqrt(mean_square)), links)
+
+
+def _each_once(keys: Keys) -> tuple[Integers, Integers]:
+    """Return where each key is (one of its places), ascending, and the number of each of `keys`.
+
+    What is equal here is equal to the bit, so that any of its places will do, and the order need
+    not be stable: numpy.unique takes several times as long.
+    """
+    order = np.argsort(keys)
+    begins = np.diff(keys[order], prepend=~keys[order[:1]]) != 0
+    which = np.empty(len(keys), dtype=np.int64)
+    which[order] = np.cumsum(begins) - 1
+    return order[begins], which
 
 
 def with_gains(sightings: Sightings, robot_of: Integers, tables: Sequence[FocalGains]) -> Sightings:

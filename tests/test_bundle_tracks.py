@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from groundfuse.backend.bundle_tracks import (
     Links,
     Sightings,
+    matched,
     observations,
-    sightings_from_edges,
     single_links,
     tracks,
 )
@@ -31,8 +31,13 @@ def edge(a, b, keypoints_a, keypoints_b, sigma=1e-3):
     return RelativePose(FRAMES[a], FRAMES[b], Se2(0, 0, 0), np.eye(3), len(sigmas), 0.0, pair)
 
 
+def keypoints(edges):
+    found = matched(edges, INDEX_OF)
+    return found.sightings, found.links
+
+
 def joined(*edges):
-    sightings, links = sightings_from_edges(edges, INDEX_OF)
+    sightings, links = keypoints(edges)
     used, point = tracks(links, sightings)
     groups = {}
     for sighting, number in zip(used.tolist(), point.tolist(), strict=True):
@@ -43,7 +48,7 @@ def joined(*edges):
 
 def test_a_keypoint_of_several_pairs_is_one_sighting():
     edges = [edge(0, 1, [7, 8], [3, 4]), edge(0, 2, [7], [5]), edge(3, 0, [1], [8])]
-    sightings, links = sightings_from_edges(edges, INDEX_OF)
+    sightings, links = keypoints(edges)
     assert len(sightings) == 6
     assert links.edge.tolist() == [0, 0, 1, 2]
     assert links.a[0] == links.a[2]
@@ -58,23 +63,33 @@ def test_the_same_ray_in_two_frames_is_two_sightings():
         pair.correspondences.rays_a, pair.correspondences.rays_a, np.ones(1), np.ones(1)
     )
     edges = [RelativePose(FRAMES[0], FRAMES[1], Se2(0, 0, 0), np.eye(3), 1, 0.0, same)]
-    sightings, links = sightings_from_edges(edges, INDEX_OF)
+    sightings, links = keypoints(edges)
     assert len(sightings) == 2
     assert links.a[0] != links.b[0]
 
 
 def test_a_keypoints_sigma_is_the_root_mean_square_over_its_pairs():
     edges = [edge(0, 1, [7], [3], 1e-3), edge(0, 2, [7], [5], 3e-3)]
-    sightings, links = sightings_from_edges(edges, INDEX_OF)
+    sightings, links = keypoints(edges)
     np.testing.assert_allclose(sightings.sigma[links.a[0]], np.sqrt(5.0) * 1e-3, rtol=1e-14)
 
 
 def test_edges_without_pictures_have_no_links():
     bare = RelativePose(FRAMES[0], FRAMES[1], Se2(0, 0, 0), np.eye(3))
-    sightings, links = sightings_from_edges([bare, edge(0, 1, [1], [1])], INDEX_OF)
+    sightings, links = keypoints([bare, edge(0, 1, [1], [1])])
     assert links.edge.tolist() == [1]
-    sightings, links = sightings_from_edges([bare], INDEX_OF)
+    sightings, links = keypoints([bare])
     assert len(sightings) == len(links) == 0
+
+
+def test_some_of_the_edges_are_numbered_anew():
+    edges = [edge(0, 1, [7], [3]), edge(1, 2, [5, 6], [4, 2]), edge(0, 2, [7], [2])]
+    kept = np.array([False, True, True])
+    some, alone = matched(edges, INDEX_OF).only_edges(kept), matched(edges[1:], INDEX_OF)
+    assert some.links.edge.tolist() == alone.links.edge.tolist() == [0, 0, 1]
+    for end in ("a", "b"):
+        rays = [m.sightings.ray[getattr(m.links, end)].tolist() for m in (some, alone)]
+        assert rays[0] == rays[1]
 
 
 def test_links_join_over_frames():

@@ -12,6 +12,7 @@ from groundfuse.backend.bundle_estimate import (
     BundleRefusal,
     MountEstimate,
 )
+from groundfuse.backend.bundle_tracks import Matched
 from groundfuse.backend.graph import RobotEstimate
 from groundfuse.backend.measurement import (
     Attitude,
@@ -25,7 +26,7 @@ from groundfuse.backend.team import TeamOptions
 from groundfuse.frontend.patches import PatchOptions
 from groundfuse.frontend.predicted import Pair, floor_outline, predicted_pairs
 from groundfuse.frontend.repetition import REPEATS
-from groundfuse.tools.aligned_edges import Desk, aligned_edges
+from groundfuse.tools.aligned_keypoints import Desk, aligned_keypoints
 from groundfuse.tools.code_version import code_of
 from groundfuse.tools.front_end import FrontEnd, FrontEndResult
 from groundfuse.tools.front_end_options import FrontEndOptions
@@ -212,7 +213,7 @@ def _looked(
     if bundled:
         rests_on = (*rests_on, known, mounts, options.patches, options.bundle)
 
-        def exact() -> Sequence[RelativePose]:
+        def exact() -> tuple[Sequence[RelativePose], Matched]:
             accepted = as_filed(accepted_edges(team, edges), robots, mounts)
             with watch.stage("patches"):
                 desk = Desk(
@@ -222,7 +223,8 @@ def _looked(
                     means.progress,
                     options.bundle.most_sightings,
                 )
-                return aligned_edges(robots, cameras, team, accepted, options.patches, desk)
+                seen = aligned_keypoints(robots, cameras, team, accepted, options.patches, desk)
+            return accepted, seen
 
         with watch.stage("bundle"):
             # A look with corrected cameras starts over: what made it necessary may explain more.

@@ -14,6 +14,7 @@ from groundfuse.backend.bundle_estimate import (
     BundleOptions,
     BundleRefusal,
 )
+from groundfuse.backend.bundle_tracks import Matched
 from groundfuse.backend.measurement import Attitude, FrameId, RelativePose, TeamEstimate
 from groundfuse.tools.code_version import code_of
 from groundfuse.tools.focal_gain import focal_gains
@@ -42,7 +43,7 @@ class KeptBundle:
 def kept_bundle(
     robots: Sequence[Robot],
     team: TeamEstimate,
-    edges: Callable[[], Sequence[RelativePose]],
+    edges: Callable[[], tuple[Sequence[RelativePose], Matched]],
     options: BundleOptions,
     store: Store,
     rests_on: Sequence[object],
@@ -54,7 +55,8 @@ def kept_bundle(
     Args:
         robots: as filed.
         team: of the Pose2 graph.
-        edges: its accepted ones; not asked for where the store has the bundle.
+        edges: its accepted ones with their correspondences, frames numbered in their order; not
+            asked for where the store has the bundle.
         options: see there.
         store: what is known.
         rests_on: all that this depends on, as parts of a key.
@@ -67,7 +69,7 @@ def kept_bundle(
     def work() -> KeptBundle:
         latest: KeptBundle | None = store.latest(KIND) if may_go_on else None
         earlier = None if latest is None else _earlier(latest, cameras, filed)
-        return KeptBundle(_bundled(robots, team, edges(), options, earlier), cameras, filed)
+        return KeptBundle(_bundled(robots, team, *edges(), options, earlier), cameras, filed)
 
     found: KeptBundle = store.kept(KIND, "team", (code, *rests_on), work)
     return found.result
@@ -90,6 +92,7 @@ def _bundled(
     robots: Sequence[Robot],
     team: TeamEstimate,
     edges: Sequence[RelativePose],
+    seen: Matched,
     options: BundleOptions,
     earlier: BundleEstimate | None,
 ) -> BundleEstimate | BundleRefusal:
@@ -104,4 +107,4 @@ def _bundled(
     }
     prior = {frame.id: frame.attitude for frame in frames}
     sigma = {frame.id: frame.sigma for frame in frames}
-    return bundle(team, edges, prior, sigma, cameras, options, earlier)
+    return bundle(team, edges, prior, sigma, cameras, options, earlier, seen)

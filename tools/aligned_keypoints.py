@@ -5,26 +5,14 @@ its pictures at once, so that a keypoint of several pairs stays one keypoint.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from groundfuse.backend.bundle import LEAST_SIGHTINGS
 from groundfuse.backend.bundle_sample import sampled
-from groundfuse.backend.bundle_tracks import (
-    Links,
-    Sightings,
-    mixed_keys,
-    sightings_from_edges,
-    tracks,
-)
-from groundfuse.backend.measurement import (
-    Array,
-    Correspondences,
-    FrameId,
-    RelativePose,
-    TeamEstimate,
-)
+from groundfuse.backend.bundle_tracks import Links, Matched, Sightings, matched, mixed_keys, tracks
+from groundfuse.backend.measurement import Array, FrameId, RelativePose, TeamEstimate
 from groundfuse.frontend.arrays import Image
 from groundfuse.frontend.patches import (
     Aligned,
@@ -90,20 +78,20 @@ class Desk:
     most_sightings: int
 
 
-def aligned_edges(
+def aligned_keypoints(
     robots: Sequence[Robot],
     placed: Sequence[Robot],
     team: TeamEstimate,
     edges: Sequence[RelativePose],
     options: PatchOptions,
     desk: Desk,
-) -> tuple[RelativePose, ...]:
-    """Return the edges with aligned correspondences.
+) -> Matched:
+    """Return the edges' correspondences with aligned keypoints.
 
     Keypoints whose patches do not fit are left out; an edge that would keep fewer than
-    `min_links` of its correspondences stays as it is. What was aligned for this team before is
-    not aligned again, though its places may be better known by now: where a patch rests depends
-    on where its picture was taken by less than a thousandth of a pixel a millimetre.
+    `min_links` of its correspondences keeps them as they are. What was aligned for this team
+    before is not aligned again, though its places may be better known by now: where a patch rests
+    depends on where its picture was taken by less than a thousandth of a pixel a millimetre.
 
     Args:
         robots: with the lenses that the edges' rays are of.
@@ -117,13 +105,13 @@ def aligned_edges(
         DataError: a picture can't be read.
     """
     frames = sorted(team.team_from_base)
-    sightings, links = sightings_from_edges(edges, {f: k for k, f in enumerate(frames)})
-    if not options.use or len(links) == 0:
-        return tuple(edges)
-    most = max(desk.most_sightings // len(frames), LEAST_SIGHTINGS)
-    used, point = sampled(*tracks(links, sightings), sightings, most)
+    seen = matched(edges, {frame: number for number, frame in enumerate(frames)})
+    if not options.use or len(seen.links) == 0:
+        return seen
+    sightings, most = seen.sightings, max(desk.most_sightings // len(frames), LEAST_SIGHTINGS)
+    used, point = sampled(*tracks(seen.links, sightings), sightings, most)
     if len(used) == 0:
-        return tuple(edges)
+        return seen
     views = _views(robots, placed, team, frames)
     points = keypoints_of(views, sightings.frame[used], sightings.ray[used], point)
     keys = _keys(_digests(robots, frames, options, desk), points)
@@ -134,8 +122,7 @@ def aligned_edges(
         others = points.finest != np.arange(len(used))
         known = KnownAlignments(*_sorted(keys[others], found[others, :3]))
         desk.store.save(key_of(KIND, known.keys), KIND, "team", packed(known))
-    exact = _with_finest(points, found)
-    return _replaced(edges, sightings, links, used, exact, options.min_links)
+    return _replaced(seen, used, _with_finest(points, found), options.min_links)
 
 
 def _views(
@@ -166,7 +153,7 @@ def _digests(
     robots: Sequence[Robot], frames: Sequence[FrameId], options: PatchOptions, desk: Desk
 ) -> Integers:
     """Return a number for each frame: of its picture, its camera, the options and the code."""
-    code = code_of("groundfuse.tools.aligned_edges", rooms=("frontend", "tools"))
+    code = code_of("groundfuse.tools.aligned_keypoints", rooms=("frontend", "tools"))
     how = {robot.name: key_of("patches", code, options, robot.camera) for robot in robots}
     both = [digest_of(how[frame.robot] + desk.pictures[frame]) for frame in frames]
     return np.array([int.from_bytes(digest[:7], "little") for digest in both], np.int64)
@@ -273,25 +260,23 @@ def _with_finest(points: Keypoints, found: Array) -> Aligned:
     return Aligned(exact, sigma)
 
 
-def _replaced(
-    edges: Sequence[RelativePose],
-    sightings: Sightings,
-    links: Links,
-    used: Integers,
-    exact: Aligned,
-    min_links: int,
-) -> tuple[RelativePose, ...]:
-    """Return the edges with the keypoints that fit, where those are enough."""
-    rays, sigma = np.full((len(sightings), 2), np.nan), np.full(len(sightings), np.nan)
-    rays[used], sigma[used] = exact.rays, exact.sigma
-    fits = np.isfinite(sigma)
-    kept = links.only(fits[links.a] & fits[links.b])
-    ends = np.searchsorted(kept.edge, np.arange(len(edges) + 1))
-    replaced = []
-    for edge, first, stop in zip(edges, ends[:-1], ends[1:], strict=True):
-        if stop - first >= min_links:
-            a, b = kept.a[first:stop], kept.b[first:stop]
-            points = Correspondences(rays[a], rays[b], sigma[a], sigma[b])
-            edge = replace(edge, correspondences=points)  # noqa: PLW2901
-        replaced.append(edge)
-    return tuple(replaced)
+def _replaced(seen: Matched, used: Integers, exact: Aligned, min_links: int) -> Matched:
+    """Put in the keypoints that fit, where they are enough; other edges keep theirs, apart."""
+    before, links, fitting = seen.sightings, seen.links, np.isfinite(exact.sigma)
+    where = used[fitting]
+    fits = np.zeros(len(before), dtype=np.bool_)
+    fits[where] = True
+    rays, sigma = before.ray.copy(), before.sigma.copy()
+    rays[where], sigma[where] = exact.rays[fitting], exact.sigma[fitting]
+    both = fits[links.a] & fits[links.b]
+    stays = np.bincount(links.edge[both], minlength=int(links.edge.max()) + 1) < min_links
+    old = stays[links.edge]
+    own, place = np.unique([links.a[old], links.b[old]], return_inverse=True)
+    a, b = links.a.copy(), links.b.copy()
+    a[old], b[old] = len(before) + place.reshape(2, -1)
+    merged = Sightings(
+        np.concatenate([before.frame, before.frame[own]]),
+        np.concatenate([rays, before.ray[own]]),
+        np.concatenate([sigma, before.sigma[own]]),
+    )
+    return Matched(merged, Links(a, b, links.edge).only(both | old))
