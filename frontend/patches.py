@@ -3,8 +3,8 @@
 A detector places a keypoint to a third of a pixel, and differently under each view. What a
 small patch around it looks like says more: least squares matching (Foerstner 1982, Gruen 1985)
 moves the keypoint, in every picture but one, to where the patch looks as it does in that one, the
-finest. In between lies the homography of the floor, with each lens linear over the patch; what a
-lens bends within the patch would shift it, and is taken off on average.
+finest. In between lies the homography of the floor, with each lens quadratic over the patch: taken
+for linear, it moves a keypoint by hundredths of a pixel far out, as another focal length would.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,8 +27,8 @@ MOST_HALVINGS = 3
 """A picture eight times as fine as another is read from its last halving."""
 LATER = 0.25
 """A picture is halved where it is 1.7 times as fine as the other, not 1.4: reading blurs, too."""
-SPREAD = 0.5
-"""Deviation of the places of a patch, weighted as they are, in radii."""
+REACH = 0.5
+"""Where in a patch a lens is asked how it goes on, in radii."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -120,8 +120,7 @@ def keypoints_of(
     # A homography's area grows with its determinant over depth cubed; the lens adds its own.
     depth = (cam_from_floor[view, 2] * _homogeneous(floor)).sum(axis=1)
     fineness = np.abs(np.linalg.det(cam_from_floor))[view] / np.abs(depth) ** 3
-    lens = _through_lenses(views, view, rays, np.ones(len(rays)))
-    fineness *= np.abs(np.linalg.det(lens.by_ray))
+    fineness *= np.abs(np.linalg.det(_through_lenses(views, view, rays, 1.0).by_ray))
     order = np.lexsort((-fineness, point))
     finest = order[np.searchsorted(point[order], np.arange(point.max() + 1))][point]
     return Keypoints(view, rays, floor, fineness, finest)
@@ -139,7 +138,9 @@ class PatchPlan:
         ray_by_px: (m, 2, 2) how a keypoint's ray moves with it.
         finest_view: (m,) number of the finest's view.
         finest_place: (m, 2) the finest, px.
-        map: (m, 3, 3) from pixels off a keypoint to pixels off its finest, homogeneous.
+        map: (m, 3, 3) from pixels (x, y) off a keypoint to pixels off its finest, homogeneous; as
+            if the lenses bent nothing there.
+        bend: (m, 2, 3) what they add to that, px: of x x, x y and y y.
         halvings: (m,) of the finest's picture that leave it about as fine as the keypoint's own.
     """
 
@@ -151,6 +152,7 @@ class PatchPlan:
     finest_view: Integers
     finest_place: Points
     map: Floats
+    bend: Floats
     halvings: Integers
 
 
@@ -167,21 +169,41 @@ def patch_plan(
     """
     cam_from_floor, finest = _cam_from_floor(views), known.finest[which]
     view, rays, there = known.view[which], known.rays[which], known.view[finest]
-    spread_px = np.full(len(which), SPREAD * options.radius_px)
-    lens = _through_lenses(views, view, rays, spread_px)
+    reach_px = REACH * options.radius_px
+    lens = _through_lenses(views, view, rays, reach_px)
+    other = _through_lenses(views, there, known.rays[finest], reach_px)
     times = np.sqrt(known.fineness[finest] / known.fineness[which])
     halvings = np.clip(np.round(np.log2(times) - LATER), 0, MOST_HALVINGS).astype(np.int64)
-    other = _through_lenses(views, there, known.rays[finest], spread_px * times)
-    ray_by_px = _inverse(lens.by_ray)
-    from_px = _affine(ray_by_px, rays - _times(ray_by_px, lens.bend))
-    eye = np.broadcast_to(np.eye(2), ray_by_px.shape)
+    from_px = _affine(lens.ray_by_px, rays)
+    eye = np.broadcast_to(np.eye(2), lens.by_ray.shape)
     shift = _affine(eye, known.floor[finest] - known.floor[which])
-    to_px = _affine(other.by_ray, other.bend - _times(other.by_ray, known.rays[finest]))
+    to_px = _affine(other.by_ray, -_times(other.by_ray, known.rays[finest]))
     floor_from_cam = np.linalg.inv(cam_from_floor)
     carried = to_px @ cam_from_floor[there] @ shift @ floor_from_cam[view] @ from_px
     return PatchPlan(
-        views, view, rays, lens.place, ray_by_px, there, other.place, carried, halvings
+        views,
+        view,
+        rays,
+        lens.place,
+        lens.ray_by_px,
+        there,
+        other.place,
+        carried,
+        _bend(carried, lens, other),
+        halvings,
     )
+
+
+def _bend(carried: Floats, lens: "_Lens", other: "_Lens") -> Floats:
+    """Return what two lenses add (n, 2, 3) to maps (n, 3, 3) between their pixels, x x, x y, y y.
+
+    The lens behind takes its bend off the pixel first; the one ahead adds its own at the end.
+    """
+    # In the middle the map is 0: its derivative is that of the numerator.
+    linear = carried[:, :2, :2] / carried[:, 2:, 2:]
+    behind, ahead = lens.bend_of(lens.ray_by_px), other.bend_of(other.ray_by_px @ linear)
+    added: Floats = ahead - linear @ behind
+    return added
 
 
 def _cam_from_floor(views: Sequence[PatchView]) -> Floats:
@@ -211,43 +233,60 @@ def _affine(linear: Floats, offset: Points) -> Floats:
 
 
 class _Lens(NamedTuple):
-    """What a lens does to rays and to what is around them, as near as a linear map comes.
+    """What a lens does to rays and to what is around them, to the second order.
 
     Attributes:
         place: (n, 2) pixels of the rays.
         by_ray: (n, 2, 2) how they move with their rays.
-        bend: (n, 2) mean of what is left, px.
+        bend: (n, 2, 3) and what is added, of steps (a, b) of the ray: of a a, a b and b b.
     """
 
     place: Points
     by_ray: Floats
-    bend: Points
+    bend: Floats
+
+    @property
+    def ray_by_px(self) -> Floats:
+        """How rays move with their pixels (n, 2, 2)."""
+        return _inverse(self.by_ray)
+
+    def bend_of(self, by: Floats) -> Floats:
+        """Return the bend (n, 2, 3) of other steps (x, y), by which the rays move so (n, 2, 2)."""
+        a_x, a_y, b_x, b_y = (by[:, None, i, j] for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)))
+        aa, ab, bb = np.moveaxis(self.bend, 2, 0)
+        xx = aa * a_x * a_x + ab * a_x * b_x + bb * b_x * b_x
+        xy = 2.0 * aa * a_x * a_y + ab * (a_x * b_y + a_y * b_x) + 2.0 * bb * b_x * b_y
+        yy = aa * a_y * a_y + ab * a_y * b_y + bb * b_y * b_y
+        return np.stack([xx, xy, yy], axis=2)
 
 
 def _through_lenses(
-    views: Sequence[PatchView], view: Integers, rays: Points, spread_px: Floats
+    views: Sequence[PatchView], view: Integers, rays: Points, reach_px: float
 ) -> _Lens:
-    """Send rays (n, 2), each with a patch of such a deviation (n,) around it, through lenses."""
+    """Send rays (n, 2) through lenses, with others at some pixels around them."""
     lenses = [v.camera.intrinsics for v in views]
     distinct = list(dict.fromkeys(lenses))
     which = np.array([distinct.index(lens) for lens in lenses])[view]
-    found = _Lens(np.empty(rays.shape), np.empty((*rays.shape, 2)), np.empty(rays.shape))
+    size = len(rays)
+    found = _Lens(np.empty((size, 2)), np.empty((size, 2, 2)), np.empty((size, 2, 3)))
     for number, lens in enumerate(distinct):
         mine = which == number
-        for whole, part in zip(found, _through(lens, rays[mine], spread_px[mine]), strict=True):
+        for whole, part in zip(found, _through(lens, rays[mine], reach_px), strict=True):
             whole[mine] = part
     return found
 
 
-def _through(lens: Intrinsics, rays: Points, spread_px: Floats) -> _Lens:
-    place, step = lens.px_from_rays(rays), (spread_px / lens.focal_px)[:, None]
-    ends = [
-        [lens.px_from_rays(rays + sign * step * unit) - place for sign in (1.0, -1.0)]
-        for unit in np.eye(2)
-    ]
-    by_ray = np.stack([(ahead - behind) / (2.0 * step) for ahead, behind in ends], axis=2)
-    bend = sum(((ahead + behind) / 2.0 for ahead, behind in ends), np.zeros(rays.shape))
-    return _Lens(place, by_ray, bend)
+def _through(lens: Intrinsics, rays: Points, reach_px: float) -> _Lens:
+    place, step = lens.px_from_rays(rays), reach_px / lens.focal_px
+
+    def ends(direction: tuple[float, float]) -> tuple[Points, Points]:
+        """Return the slope along a direction, and half the curvature."""
+        way = step * np.array(direction)
+        ahead, behind = lens.px_from_rays(rays + way), lens.px_from_rays(rays - way)
+        return (ahead - behind) / (2.0 * step), ((ahead + behind) / 2.0 - place) / step**2
+
+    (by_a, aa), (by_b, bb), (_, both) = ends((1.0, 0.0)), ends((0.0, 1.0)), ends((1.0, 1.0))
+    return _Lens(place, np.stack([by_a, by_b], axis=2), np.stack([aa, both - aa - bb, bb], axis=2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -310,7 +349,8 @@ def fill_from(plan: PatchPlan, which: Integers, picture: GreyPicture, templates:
         first, last = np.ceil(rows[0] * share), np.floor(rows[1] * share)
         maps = plan.map[some] * np.array([share, share, 1.0])[:, None]
         middle = plan.finest_place[some] * share
-        fill_templates(halved, (int(first), int(last)), some, middle, maps, templates)
+        how = maps, plan.bend[some] * share
+        fill_templates(halved, (int(first), int(last)), some, middle, how, templates)
 
 
 def aligned(

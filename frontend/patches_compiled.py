@@ -35,7 +35,7 @@ def fill_templates(
     rows: tuple[int, int],
     which: Any,  # noqa: ANN401
     places: Any,  # noqa: ANN401
-    maps: Any,  # noqa: ANN401
+    how: tuple[Any, Any],
     templates: Any,  # noqa: ANN401
 ) -> None:
     """Read patches of a picture as other pictures would show them; nan at the first pixel: none.
@@ -45,19 +45,22 @@ def fill_templates(
         rows: first and last row that may be read.
         which: (m,) numbers of the templates to fill.
         places: (m, 2) middle of each in the picture.
-        maps: (m, 3, 3) homographies from pixels off the middle there to pixels off the middle here.
+        how: (m, 3, 3) homographies from pixels (x, y) off the middle there to pixels off the middle
+            here, and (m, 2, 3) what is added, of x x, x y and y y.
         templates: (n, side, side) float32 to fill.
     """
     side = templates.shape[1]
     reach, last_u = side // 2, picture.shape[1] - 1
     for k in range(len(which)):
-        n, m = which[k], maps[k]
+        n, m, b = which[k], how[0][k], how[1][k]
         for i in range(side):
             for j in range(side):
                 x, y = np.float64(j - reach), np.float64(i - reach)
                 depth = m[2, 0] * x + m[2, 1] * y + m[2, 2]
                 u = places[k, 0] + (m[0, 0] * x + m[0, 1] * y + m[0, 2]) / depth
                 v = places[k, 1] + (m[1, 0] * x + m[1, 1] * y + m[1, 2]) / depth
+                u += b[0, 0] * x * x + b[0, 1] * x * y + b[0, 2] * y * y
+                v += b[1, 0] * x * x + b[1, 1] * x * y + b[1, 2] * y * y
                 if not (u >= 0.0 and u < last_u and v >= rows[0] and v < rows[1]):
                     templates[n, 0, 0] = np.nan
                     break
