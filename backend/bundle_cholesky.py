@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import get_blas_funcs, get_lapack_funcs
 
-from groundfuse.backend.bundle_compiled import add_update, assemble
+from groundfuse.backend.bundle_compiled import add_update, assemble, take_square
 from groundfuse.backend.bundle_plan import BLOCK, Front, Integers, scalars
 
 Array = NDArray[np.float64]
@@ -64,6 +64,35 @@ def factorise(fronts: tuple[Front, ...], blocks: Array, num_nodes: int) -> Facto
             updates[front.parent].append(update)
             children[front.parent].append(index)
     return Factor(fronts, tuple(diagonal), tuple(below), num_nodes)
+
+
+def with_held(factor: Factor, held: Integers) -> Factor:
+    """Return the factor of the matrix with some unknowns held: their rows and columns are unit.
+
+    Only unknowns of the last front: all others are eliminated as before.
+
+    Args:
+        factor: see there.
+        held: scalar positions in the matrix.
+
+    Raises:
+        ValueError: one of them is eliminated earlier.
+    """
+    is_held = np.zeros(BLOCK * factor.num_nodes, dtype=np.bool_)
+    is_held[held] = True
+    diagonal, below = [], []
+    for front, corner, rows in zip(factor.fronts, factor.diagonal, factor.below, strict=True):
+        own, later = is_held[scalars(front.own)], is_held[scalars(front.later)]
+        if own.any():
+            if len(later):
+                raise ValueError(f"only unknowns of the last front can be held, got {own.sum()}")
+            whole = corner @ corner.T
+            whole[own], whole[:, own] = 0.0, 0.0
+            whole[own, own] = 1.0
+            corner = POTRF(whole, lower=1, clean=1)[0]  # noqa: PLW2901
+        diagonal.append(corner)
+        below.append(np.where(later[:, None], 0.0, rows))
+    return Factor(factor.fronts, tuple(diagonal), tuple(below), factor.num_nodes)
 
 
 def _lower_solve(lower: Array, right: Array, *, transposed: bool = False) -> Array:
@@ -124,8 +153,11 @@ def _inverse_front(factor: Factor, index: int, waiting: list[Array | None]) -> A
     parent = waiting[front.parent] if front.parent >= 0 else None
     if parent is None:
         return own
-    gain = rows @ half
-    later = parent[front.place[:, None], front.place]
-    cross = -later @ gain
-    dense: Array = np.block([[own - gain.T @ cross, cross.T], [cross, later]])
+    size, first = len(own) + len(rows), len(own)
+    dense, gain = np.empty((size, size)), rows @ half
+    later, cross = dense[first:, first:], dense[first:, :first]
+    take_square(parent, front.place, later)
+    cross[:] = -later @ gain
+    dense[:first, :first] = own - gain.T @ cross
+    dense[:first, first:] = cross.T
     return dense

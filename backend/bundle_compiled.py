@@ -115,35 +115,6 @@ def taken_steps(out: Any, step: Any, frame_start: Any, point: Any, rest: Any) ->
 
 
 @compiled
-def meeting_chi2(
-    ends: tuple[Any, Any],
-    landing: tuple[Any, Any, Any],
-    relief_m: Any,  # noqa: ANN401
-    chi2: Any,  # noqa: ANN401
-) -> None:
-    """Squared distances on the floor over their variance; inf where a ray meets no floor.
-
-    Args:
-        ends: sightings (n,) of both ends of each correspondence.
-        landing: points (m, 2), covariances (m, 2, 2), ways per height (m, 2) of the sightings.
-        relief_m: (m,) deviation of the floor's heights where each sighting is; 0 if flat.
-        chi2: (n,) written.
-    """
-    one, other = ends
-    point, spread, slope = landing
-    for n in range(len(one)):
-        a, b = one[n], other[n]
-        x, y = point[a, 0] - point[b, 0], point[a, 1] - point[b, 1]
-        px = relief_m[a] * (slope[a, 0] - slope[b, 0])
-        py = relief_m[a] * (slope[a, 1] - slope[b, 1])
-        xx = spread[a, 0, 0] + spread[b, 0, 0] + px * px
-        xy = spread[a, 0, 1] + spread[b, 0, 1] + px * py
-        yy = spread[a, 1, 1] + spread[b, 1, 1] + py * py
-        found = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
-        chi2[n] = found if np.isfinite(found) else np.inf
-
-
-@compiled
 def assemble(
     blocks: Any,  # noqa: ANN401
     entry: Any,  # noqa: ANN401
@@ -167,6 +138,15 @@ def assemble(
             for j in range(BLOCK):
                 value = block[j, i] if flip[e] else block[i, j]
                 dense[BLOCK * row[e] + i, BLOCK * column[e] + j] += value
+
+
+@compiled
+def take_square(matrix: Any, place: Any, square: Any) -> None:  # noqa: ANN401
+    """Write rows and columns `place` (k,) of a matrix, (k, k)."""
+    for i in range(len(place)):
+        row = matrix[place[i]]
+        for j in range(len(place)):
+            square[i, j] = row[place[j]]
 
 
 @compiled

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from groundfuse.backend.bundle_compiled import meeting_chi2
 from groundfuse.backend.bundle_estimate import BundleOptions
+from groundfuse.backend.bundle_landing_compiled import meeting_chi2
 from groundfuse.backend.bundle_model import State, floor_points
 from groundfuse.backend.bundle_priors import Priors
 from groundfuse.backend.bundle_tracks import Links, Sightings
@@ -41,11 +41,10 @@ def link_chi2(
     A point above the floor lands elsewhere for each camera: relief counts as variance.
     """
     landing = floor_points(sightings.frame, sightings.ray, sightings.gain, state, priors.robot_of)
-    spread = landing.by_ray @ landing.by_ray.transpose(0, 2, 1)
-    spread *= ((noise * sightings.sigma) ** 2)[:, None, None]
     relief_m = priors.relief * state.attitude[sightings.frame, 2]
     chi2 = np.empty(len(links))
-    meeting_chi2((links.a, links.b), (landing.point, spread, landing.slope), relief_m, chi2)
+    sigma = noise * sightings.sigma
+    meeting_chi2((links.a, links.b), landing, sigma, relief_m, chi2)
     return chi2
 
 

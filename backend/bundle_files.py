@@ -10,10 +10,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from groundfuse.backend.bundle_cholesky import Factor, factorise, inverse_between
+from groundfuse.backend.bundle_cholesky import Factor, inverse_between, with_held
 from groundfuse.backend.bundle_estimate import BundleOptions, Refine
 from groundfuse.backend.bundle_kernel import Kernel
 from groundfuse.backend.bundle_model import State
+from groundfuse.backend.bundle_plan import BLOCK
 from groundfuse.backend.bundle_priors import Priors
 from groundfuse.backend.bundle_solve import (
     Problem,
@@ -71,18 +72,12 @@ def files_test(problem: Problem, solution: Solution, options: BundleOptions) -> 
 
 
 def _held_factor(problem: Problem, system: System, asked: Mask) -> Factor:
-    """Factorise a system with the numbers held that were free only for the test."""
-    priors, pattern = problem.priors, problem.pattern
-    held = asked & ~np.hstack([priors.free_mount, priors.free_lens])
+    """Return the factor with the numbers held that were free only for the test."""
+    held = asked & ~np.hstack([problem.priors.free_mount, problem.priors.free_lens])
     if not held.any():
         return system.factor
-    blocks = system.reduced.blocks.copy()
-    for robot, axis in np.argwhere(held).tolist():
-        node = priors.num_frames + robot
-        blocks[pattern.rows == node, axis, :] = 0.0
-        blocks[pattern.columns == node, :, axis] = 0.0
-        blocks[node, axis, axis] = 1.0
-    return factorise(problem.fronts, blocks, priors.num_nodes)
+    robot, axis = np.nonzero(held)
+    return with_held(system.factor, BLOCK * (problem.priors.num_frames + robot) + axis)
 
 
 def freed_priors(priors: Priors, free: Mask) -> Priors:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from groundfuse.backend.bundle_landing_compiled import Landing, land
 from groundfuse.backend.bundle_rows_compiled import (
     Lines,
     Placed,
@@ -106,44 +107,20 @@ def derivatives(
     return lines
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Landing:
-    """Where rays meet the flat floor, in the component's frame.
-
-    Attributes:
-        point: (n, 2) m; nan above the horizon.
-        by_ray: (n, 2, 2) its derivative by the ray.
-        slope: (n, 2) horizontal way of the ray per height.
-    """
-
-    point: Array
-    by_ray: Array
-    slope: Array
-
-
 def floor_points(
     frame: Integers, ray: Array, gain: Array | None, state: State, robot_of: Integers
 ) -> Landing:
     """Intersect rays with the flat floor; `gain` (n,) as in `Sightings`."""
-    shared = state.shared[robot_of[frame]]
-    radius2 = np.sum(ray * ray, axis=1, keepdims=True)
-    longer = shared[:, 3:4] * (1.0 if gain is None else gain[:, None])
-    ray = ray / ((1.0 + longer) * (1.0 + shared[:, 4:5] * radius2))
-    ca, sa = np.cos(state.attitude[:, 0])[frame], np.sin(state.attitude[:, 0])[frame]
-    cr, sr = np.cos(state.attitude[:, 1])[frame], np.sin(state.attitude[:, 1])[frame]
-    h = state.attitude[:, 2][frame]
-    x, y = ray.T
-    lean = sa * y + ca
-    fall = sr * x + cr * lean
-    per = 1.0 / np.where(fall > NEAR, fall, np.nan)
-    qx, qy = (sa - ca * y) * per, (sr * lean - cr * x) * per  # in heights
-    by_x = np.stack([-qx * sr, -cr - qy * sr], axis=1) * (h * per)[:, None]
-    by_y = np.stack([-ca - qx * cr * sa, sr * sa - qy * cr * sa], axis=1) * (h * per)[:, None]
-    turn_c, turn_s = np.cos(state.pose[:, 2])[frame], np.sin(state.pose[:, 2])[frame]
-    turn = np.stack([np.stack([turn_c, -turn_s], 1), np.stack([turn_s, turn_c], 1)], axis=1)
-    slope = (turn @ np.stack([qx, qy], axis=1)[:, :, None])[:, :, 0]
-    points = slope * h[:, None] + state.pose[frame, :2]
-    return Landing(points, turn @ np.stack([by_x, by_y], axis=2), slope)
+    count, at = len(frame), placed(state, robot_of)
+    longer = np.ones(count) if gain is None else gain
+    landing = Landing(*map(np.empty, ((count, 2), (count, 2, 2), (count, 2))))
+
+    def drop(part: slice) -> None:
+        mine = Landing(*(of[part] for of in landing))
+        land(frame[part], ray[part], longer[part], at, NEAR, mine)
+
+    side_by_side(drop, count)
+    return landing
 
 
 def moved(state: State, step: Array, point_step: Array) -> State:

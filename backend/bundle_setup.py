@@ -10,6 +10,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from groundfuse.backend.bundle_estimate import BundleCamera, BundleOptions
+from groundfuse.backend.bundle_landing_compiled import weighted_places
 from groundfuse.backend.bundle_model import State, floor_points
 from groundfuse.backend.bundle_priors import Between, Priors
 from groundfuse.backend.bundle_tracks import Integers, Observations
@@ -143,15 +144,8 @@ def start_state(
 def with_points(state: State, seen: Observations, robot_of: Integers) -> State:
     """Put each floor point where its sightings meet the floor, by the precision of each there."""
     landing = floor_points(seen.frame, seen.ray, seen.gain, state, robot_of)
-    good = np.isfinite(landing.point).all(axis=1)
-    place, to_ray = landing.point[good], np.linalg.inv(landing.by_ray[good])
-    information = to_ray.transpose(0, 2, 1) @ to_ray / seen.sigma[good, None, None] ** 2
-    pulled = (information @ place[:, :, None])[:, :, 0]
-    columns = (*information.reshape(-1, 4)[:, [0, 1, 3]].T, *pulled.T)
-    xx, xy, yy, x, y = (np.bincount(seen.point[good], c, seen.num_points) for c in columns)
-    points, seen_at_all = np.zeros((seen.num_points, 3)), xx > 0.0
-    determinant = np.where(seen_at_all, xx * yy - xy * xy, 1.0)
-    points[:, 0], points[:, 1] = (yy * x - xy * y) / determinant, (xx * y - xy * x) / determinant
+    points = np.empty((seen.num_points, 3))
+    weighted_places(seen.point, seen.sigma, landing, points)
     return State(state.pose, state.attitude, state.shared, points)
 
 

@@ -11,6 +11,7 @@ from groundfuse.backend.bundle_cholesky import (
     inverse_between,
     inverse_diagonal,
     solve,
+    with_held,
 )
 from groundfuse.backend.bundle_plan import BLOCK, elimination_order, plan
 
@@ -53,6 +54,38 @@ def test_solution_and_inverse_agree_with_dense_ones(num_nodes, num_pairs, seed, 
     np.testing.assert_allclose(inverse_diagonal(factor), expected, atol=TOLERANCE)
     between = inverse[last][:, :, last].reshape(BLOCK * len(last), BLOCK * len(last))
     np.testing.assert_allclose(inverse_between(factor, last), between, atol=TOLERANCE)
+
+
+@settings(max_examples=40)
+@given(st.integers(2, 12), st.integers(0, 50), st.integers(0, 999), st.integers(1, 3))
+def test_unknowns_of_the_last_nodes_can_be_held(num_nodes, num_pairs, seed, num_last):
+    """As in the dense matrix with their rows and columns unit, factorised from the beginning."""
+    rows, columns, blocks, dense = random_system(num_nodes, num_pairs, seed)
+    last = np.arange(num_nodes - min(num_last, num_nodes), num_nodes)
+    # The bundle's robots are all tied to each other, so that they lie in one front.
+    i, j = np.triu_indices(len(last), 1)
+    rows, columns = np.concatenate([rows, last[i]]), np.concatenate([columns, last[j]])
+    blocks = np.concatenate([blocks, np.zeros((len(i), BLOCK, BLOCK))])
+    factor = factorise(plan(rows, columns, num_nodes, last), blocks, num_nodes)
+    rng = np.random.default_rng(seed)
+    held = rng.choice(BLOCK * len(last), rng.integers(1, BLOCK * len(last) + 1), replace=False)
+    held += BLOCK * last[0]
+    dense[held], dense[:, held] = 0.0, 0.0
+    dense[held, held] = 1.0
+    right = rng.normal(size=BLOCK * num_nodes)
+    found = solve(with_held(factor, held), right)
+    np.testing.assert_allclose(dense @ found, right, atol=TOLERANCE * 100)
+    inverse = np.linalg.inv(dense).reshape(num_nodes, BLOCK, num_nodes, BLOCK)
+    expected = inverse[np.arange(num_nodes), :, np.arange(num_nodes), :]
+    np.testing.assert_allclose(inverse_diagonal(with_held(factor, held)), expected, atol=TOLERANCE)
+
+
+def test_an_unknown_that_is_eliminated_early_cannot_be_held():
+    rows, columns, blocks, _ = random_system(9, 14, 1)
+    factor = factorise(plan(rows, columns, 9, np.array([8])), blocks, 9)
+    early = BLOCK * factor.fronts[0].own[0]
+    with pytest.raises(ValueError, match="only unknowns of the last front can be held, got 1"):
+        with_held(factor, np.array([early]))
 
 
 def test_last_nodes_come_last_and_every_node_once():

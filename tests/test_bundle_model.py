@@ -1,11 +1,14 @@
 """The bundle's camera against the front-end's, `transfer` and differences."""
 
 import math
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from groundfuse.backend.bundle_cut import link_chi2
 from groundfuse.backend.bundle_model import (
     State,
     derivatives,
@@ -13,7 +16,8 @@ from groundfuse.backend.bundle_model import (
     moved,
     residuals,
 )
-from groundfuse.backend.bundle_tracks import Sightings, observations
+from groundfuse.backend.bundle_setup import with_points
+from groundfuse.backend.bundle_tracks import Links, Sightings, observations
 from groundfuse.backend.measurement import Attitude, Se2
 from groundfuse.backend.reprojection import transfer
 from groundfuse.frontend.overhead import floor_from_rays, rays_from_floor
@@ -126,6 +130,51 @@ def test_the_lens_is_taken_off_before_rays_meet_the_floor():
     np.testing.assert_allclose(points, true, atol=3e-3)
     plain = floor_points(seen.frame, seen.ray, seen.gain, with_shared(state, 0.0), ROBOT_OF).point
     assert np.abs(points - true).max() < np.abs(plain - true).max() / 20
+
+
+@given(poses, attitudes, st.integers(0, 99))
+def test_points_begin_at_the_weighted_mean_of_where_their_rays_land(pose, attitude, seed):
+    seen, state = seen_from(pose, attitude, (0.0, 0.0), seed)
+    rng = np.random.default_rng(seed)
+    seen = replace(
+        seen,
+        ray=seen.ray + rng.normal(0.0, 1e-3, seen.ray.shape),
+        sigma=rng.uniform(0.5, 2.0, len(seen.ray)),
+        point=rng.integers(0, 2, len(seen.ray)),
+        num_points=3,
+    )
+    landing = floor_points(seen.frame, seen.ray, seen.gain, state, ROBOT_OF)
+    found = with_points(state, seen, ROBOT_OF).point
+    for point in range(3):
+        mine = seen.point == point
+        spread = landing.by_ray[mine] @ landing.by_ray[mine].transpose(0, 2, 1)
+        information = np.linalg.inv(spread * seen.sigma[mine, None, None] ** 2)
+        pulled = (information @ landing.point[mine][:, :, None]).sum(axis=0)[:, 0]
+        wanted = np.linalg.solve(information.sum(axis=0), pulled) if mine.any() else np.zeros(2)
+        # Both routes invert, and a camera at 0.9 rad sees rays near its horizon.
+        np.testing.assert_allclose(found[point], [*wanted, 0.0], rtol=1e-8, atol=1e-9)
+
+
+@given(poses, attitudes, st.integers(0, 99), st.floats(0.0, 0.05))
+def test_ends_meet_by_the_variance_of_both_and_the_reliefs(pose, attitude, seed, relief):
+    seen, state = seen_from(pose, attitude, (0.0, 0.0), seed)
+    rng = np.random.default_rng(seed)
+    sigma = rng.uniform(1e-3, 2e-3, len(seen.ray))
+    rays = seen.ray + rng.normal(0.0, 1e-3, seen.ray.shape)
+    sightings = Sightings(seen.frame, rays, sigma, seen.gain)
+    a, b = rng.permutation(len(rays)), rng.permutation(len(rays))
+    links = Links(a, b, np.zeros_like(a))
+    priors = SimpleNamespace(relief=relief, robot_of=ROBOT_OF)
+    found = link_chi2(links, sightings, state, priors, 1.3)
+    landing = floor_points(seen.frame, rays, seen.gain, state, ROBOT_OF)
+    for one, other, chi2 in zip(a.tolist(), b.tolist(), found.tolist(), strict=True):
+        apart = landing.point[one] - landing.point[other]
+        slope = landing.slope[one] - landing.slope[other]
+        tilted = relief * state.attitude[seen.frame[one], 2] * slope
+        spread = np.outer(tilted, tilted)
+        for end in (one, other):
+            spread += landing.by_ray[end] @ landing.by_ray[end].T * (1.3 * sigma[end]) ** 2
+        np.testing.assert_allclose(chi2, apart @ np.linalg.solve(spread, apart), rtol=1e-7)
 
 
 def with_shared(state, value):
