@@ -200,7 +200,8 @@ def minimise(
             state, errors, steps = tried, tried_errors, steps + 1
             done = chi2 < settled and system.damping == 0.0
             damping = system.damping / 10.0 if system.damping > FIRST_DAMPING else 0.0
-            slow = chi2 > max(CHORD_GAIN * last_chi2, settled) and not done
+            # Unless another step as good as this one is the last.
+            slow = chi2 > CHORD_GAIN * last_chi2 and chi2**2 > settled * last_chi2 and not done
             system, last_chi2 = (None, np.inf) if slow or damping else (system, chi2)
         elif last_chi2 < np.inf:
             system, last_chi2 = None, np.inf
