@@ -149,7 +149,8 @@ def _table(found: Candidates) -> Table:
     count = len(found.index_a)
     places, turned = np.empty((count, 4)), np.empty((count, 2), dtype=np.float32)
     places[:, :2], places[:, 2:] = found.floor_a, found.floor_b
-    turned[:, 0], turned[:, 1] = np.cos(found.turn_rad), np.sin(found.turn_rad)
+    turn_rad = found.turn_rad.astype(np.float32)
+    turned[:, 0], turned[:, 1] = np.cos(turn_rad), np.sin(turn_rad)
     first = np.flatnonzero(found.index_a[1:] != found.index_a[:-1]) + 1
     starts = np.concatenate([[0], first, [count]])
     cumulative = np.cumsum(1.0 / (1.0 + found.rank))
@@ -164,7 +165,8 @@ def _limits(
     gate: Gate | None,
 ) -> Limits:
     """Return what is asked of a motion; a gate gives way by the tolerance that wobble needs."""
-    centre = np.median(found.floor_b, axis=0)
+    middle = len(found.floor_b) // 2
+    centre = np.partition(found.floor_b.T.copy(), middle)[:, middle]
     expected, gate_m, gate_rad = np.array([1.0, 0.0, 0.0, 0.0]), np.inf, np.inf
     if gate is not None:
         size_m = float(np.sqrt(((found.floor_b - centre) ** 2).sum(axis=1).mean()))

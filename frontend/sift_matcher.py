@@ -124,7 +124,8 @@ def candidates(a: Features, b: Features, options: MatchOptions) -> Candidates:
     alike = np.abs(a.log_size[index_a] - b.log_size[index_b]) < options.max_log_size
     index_a, index_b, rank = index_a[alike], index_b[alike], rank[alike]
     turn_rad = a.angle_rad[index_a] - b.angle_rad[index_b]
-    return Candidates(a.floor_m[index_a], b.floor_m[index_b], index_a, index_b, rank, turn_rad)
+    places = a.floor_m.take(index_a, axis=0), b.floor_m.take(index_b, axis=0)
+    return Candidates(*places, index_a, index_b, rank, turn_rad)
 
 
 def _similarities(a: Features, b: Features) -> Picture32:
