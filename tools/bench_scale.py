@@ -11,9 +11,11 @@ kept and used again with `--keep FOLDER`. Run it on an idle machine.
 
 import argparse
 import os
+import statistics
 import sys
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -28,6 +30,10 @@ from groundfuse.tools.errors import TeamError
 from groundfuse.tools.front_end_options import Matcher
 
 STAGES = ("features", "retrieval", "pairs", "graphs", "patches", "bundle", "mosaic")
+WARMING = 2
+"""Pictures of each robot that are looked at before time is taken."""
+TURNS = 3
+"""Times that one thread and two do the same work."""
 
 
 def exponent(frames: Sequence[int], seconds: Sequence[float]) -> float:
@@ -94,13 +100,15 @@ def bench_speed(floor: str, seed: int) -> None:
 
 
 def bench_gain(size: int, seed: int, folder: Path) -> None:
-    """Print what a second thread is worth."""
+    """Print what a second thread is worth, in medians of turns about, with code loaded before."""
     robots = fleet(folder, size, seed)
-    one, two = ({"features": 0.0, "pairs": 0.0} | matching_s(robots, n) for n in (1, 2))
+    matching_s([replace(robot, frames=robot.frames[:WARMING]) for robot in robots], 1)
+    turns = [[matching_s(robots, threads) for threads in (1, 2)] for _ in range(TURNS)]
     for stage in ("features", "pairs"):
+        one, two = (statistics.median(turn[k].get(stage, 0.0) for turn in turns) for k in (0, 1))
         print(
-            f"{size} frames, {stage}: {one[stage]:.1f} s with 1 thread, {two[stage]:.1f} s with 2:"
-            f" {one[stage] / two[stage]:.2f} times as fast",
+            f"{size} frames, {stage}: {one:.1f} s with 1 thread, {two:.1f} s with 2:"
+            f" {one / two:.2f} times as fast",
             flush=True,
         )
 
