@@ -8,7 +8,6 @@ import numpy as np
 
 from groundfuse.backend.measurement import Correspondences, Reason
 from groundfuse.backend.option_checks import check_numbers
-from groundfuse.frontend.arrays import Picture32
 from groundfuse.frontend.consensus import (
     Candidates,
     ConsensusOptions,
@@ -18,7 +17,7 @@ from groundfuse.frontend.consensus import (
 )
 from groundfuse.frontend.features import Features
 from groundfuse.frontend.matches import Matches, Miss
-from groundfuse.frontend.nearest_compiled import most_similar
+from groundfuse.frontend.nearest_compiled import fewest_apart, most_similar
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,7 +116,7 @@ def candidates(a: Features, b: Features, options: MatchOptions) -> Candidates:
     """Return the nearest features of b for every feature of a."""
     count = min(options.num_neighbours, len(b))
     nearest = np.empty((len(a), count), dtype=np.int64)
-    most_similar(_similarities(a, b), nearest)
+    _find_nearest(a.descriptors, b.descriptors, nearest)
     index_b = nearest.ravel()
     index_a = np.repeat(np.arange(len(a)), count)
     rank = np.tile(np.arange(count), len(a))
@@ -128,17 +127,12 @@ def candidates(a: Features, b: Features, options: MatchOptions) -> Candidates:
     return Candidates(*places, index_a, index_b, rank, turn_rad)
 
 
-def _similarities(a: Features, b: Features) -> Picture32:
-    """How much less than the largest the Euclidean or Hamming distances are, up to a factor."""
-    similarity: Picture32 = _signed(a.descriptors) @ _signed(b.descriptors).T
-    return similarity
-
-
-def _signed(descriptors: np.ndarray[Any, Any]) -> Picture32:
-    """Bits as -1 and 1; anything else as it is."""
-    if descriptors.dtype == np.uint8:
-        return np.unpackbits(descriptors, axis=1).astype(np.float32) * 2.0 - 1.0
-    return descriptors
+def _find_nearest(a: np.ndarray[Any, Any], b: np.ndarray[Any, Any], nearest: np.ndarray) -> None:
+    """Write the rows of b at the least Euclidean or Hamming distance from each row of a."""
+    if a.dtype == np.uint8:
+        fewest_apart(a.view(np.uint64), np.ascontiguousarray(b.view(np.uint64).T), nearest)
+    else:
+        most_similar(a @ b.T, nearest)
 
 
 def correspondences(
