@@ -6,7 +6,9 @@ start within a pixel or two ends at the same place; without the local normalisat
 the light instead of the floor.
 """
 
+import functools
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -14,15 +16,20 @@ from numpy.typing import NDArray
 
 from groundfuse.backend.measurement import Attitude, Se2
 from groundfuse.backend.option_checks import check_numbers
-from groundfuse.frontend.arrays import Floats, Image, Mask, Picture32, Points
+from groundfuse.frontend.arrays import Floats, Image, Mask, Points
 from groundfuse.frontend.camera import Camera, Intrinsics
 from groundfuse.frontend.fit import Prior
 from groundfuse.frontend.fit_compiled import transfer_rows
 from groundfuse.frontend.normalise import local_contrast
 from groundfuse.frontend.normalise_compiled import halves
+from groundfuse.frontend.photometric_compiled import Lens, Slopes, linearise, weigh
 
 RAY_STEP = 1e-6
 MAD_TO_SIGMA = 1.4826
+SETTLED, NEARLY = 1e-4, 1e-2
+"""Squared length of a step in sigmas that ends the last pass, and those before it."""
+REMEMBERED = 64
+"""Blurred pictures whose points are remembered: those of a few pictures, some 100 kB each."""
 FAINTEST = 1e-3  # local standard deviations: below is the rounding of the normalised pictures
 
 
@@ -130,44 +137,39 @@ def align(
     mean, sigma = _joint(prior_a, prior_b)
     pose, attitude = start, np.concatenate([_vector(found) for found in attitudes])
     light = np.array([1.0, 0.0])
-    hessian, residual, contrast, points = np.eye(11), np.inf, 0.0, np.zeros((0, 2))
+    hessian, residual, contrast, points = np.eye(11), np.inf, 0.0, _NO_POINTS
     for blur_px in options.blurs_px:
-        blurred_a, blurred_b = (_blurred(view, blur_px) for view in (a, b))
-        points = _points(blurred_a, a, b, pose, attitude, options)
-        if len(points) < options.min_points:
+        points = _shared(_steepest(a, blur_px, options.cell_px), a, b, pose, attitude, options)
+        if len(points.grey) < options.min_points:
             return None
-        rays_a = a.camera.intrinsics.rays_from_px(points)
-        wanted = _sampled(blurred_a, points)
-        contrast = MAD_TO_SIGMA * float(np.median(np.abs(wanted - np.median(wanted))))
-        slopes = [_slope(blurred_b, *axis) for axis in ((1, 0), (0, 1))]
+        contrast = MAD_TO_SIGMA * float(np.median(np.abs(points.grey - np.median(points.grey))))
+        pictured = _pictured(b, blur_px)
+        lens = _lens(b.camera.intrinsics, _rows(points.rays, pose, attitude)[:, :, 11])
         for _ in range(options.iterations):
-            error, jacobian = _linearised(
-                rays_a, wanted, blurred_b, slopes, b.camera.intrinsics, pose, attitude, light
-            )
-            residual = max(FAINTEST, MAD_TO_SIGMA * float(np.median(np.abs(error))))
-            weight = 1.0 / (1.0 + (error / (options.cauchy_sigmas * residual)) ** 2) / residual**2
-            hessian, step = _step(error, jacobian, weight, sigma, mean - attitude)
+            error, jacobian = _linearised(points, pictured, lens, pose, attitude, light)
+            middle = len(error) // 2
+            deviation = MAD_TO_SIGMA * float(np.partition(np.abs(error), middle)[middle])
+            residual = max(FAINTEST, deviation)
+            hessian, gradient = _prior_part(sigma) + 1e-9 * np.eye(11), np.zeros(11)
+            gradient[3:9] = (attitude - mean) / sigma**2
+            weigh(error, jacobian, residual, options.cauchy_sigmas, (hessian, gradient))
+            step: Floats = -np.linalg.solve(hessian, gradient).astype(np.float64)
             pose = pose @ Se2(float(step[0]), float(step[1]), float(step[2]))
             attitude, light = attitude + step[3:9], light + step[9:]
-            if step @ hessian @ step < 1e-4:
+            if step @ hessian @ step < (SETTLED if blur_px == options.blurs_px[-1] else NEARLY):
                 break
     explained = abs(float(light[0])) * contrast
     # Only the data's part of the information is worth less for what points share.
-    prior_part = np.diag(np.r_[np.zeros(3), 1.0 / sigma**2, np.zeros(2)])
+    prior_part = _prior_part(sigma)
     covariance = np.linalg.inv((hessian - prior_part) / options.correlation + prior_part)[:3, :3]
     return Alignment(
         pose,
         (covariance + covariance.T) / 2.0,
         Attitude(*map(float, attitude[:3])),
         Attitude(*map(float, attitude[3:])),
-        len(points),
+        len(points.grey),
         residual / explained if explained > FAINTEST else np.inf,
     )
-
-
-def _blurred(view: GreyView, blur_px: float) -> Picture32:
-    blurred = cv2.GaussianBlur(view.normalised.astype(np.float32), (0, 0), blur_px)
-    return np.asarray(blurred, dtype=np.float32)
 
 
 def _joint(prior_a: Prior, prior_b: Prior) -> tuple[Floats, Floats]:
@@ -179,32 +181,54 @@ def _vector(attitude: Attitude) -> Floats:
     return np.array([attitude.tilt_rad, attitude.roll_rad, attitude.height_m])
 
 
-def _points(
-    picture: Picture32,
+def _prior_part(sigma: Floats) -> Floats:
+    """Return what the priors add to the normal equations (11, 11)."""
+    return np.diag(np.concatenate([np.zeros(3), 1.0 / sigma**2, np.zeros(2)]))
+
+
+class _Steep(NamedTuple):
+    """Pixels (n, 2) of a blurred picture, their rays (n, 2) and grey values (n,)."""
+
+    points_px: Points
+    rays: Points
+    grey: Floats
+
+
+_NO_POINTS = _Steep(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
+
+
+@functools.lru_cache(maxsize=REMEMBERED)
+def _steepest(view: GreyView, blur_px: float, cell_px: int) -> _Steep:
+    """Return the steepest pixel of each cell; remembered, as a picture is part of many pairs."""
+    picture, right, down = _pictured(view, blur_px)
+    steep = right**2 + down**2
+    rows, columns = (side // cell_px for side in steep.shape)
+    blocks = steep[: rows * cell_px, : columns * cell_px].reshape(rows, cell_px, columns, cell_px)
+    place = blocks.transpose(0, 2, 1, 3).reshape(rows, columns, cell_px**2).argmax(axis=2)
+    v = (np.arange(rows)[:, None] * cell_px + place // cell_px).ravel()
+    u = (np.arange(columns)[None, :] * cell_px + place % cell_px).ravel()
+    points = np.column_stack([u, v]).astype(np.float64)
+    inside = _inside(points, view.camera)
+    rays = view.camera.intrinsics.rays_from_px(points[inside])
+    return _Steep(points[inside], rays, picture[v, u][inside].astype(np.float64))
+
+
+def _shared(
+    steep: _Steep,
     a: GreyView,
     b: GreyView,
     pose: Se2,
     attitude: Floats,
     options: PhotometricOptions,
-) -> Points:
-    """The steepest pixel of each cell of a that b shows too, at a similar resolution."""
-    steep = _slope(picture, 1, 0) ** 2 + _slope(picture, 0, 1) ** 2
-    cell = options.cell_px
-    rows, columns = (side // cell for side in steep.shape)
-    blocks = steep[: rows * cell, : columns * cell].reshape(rows, cell, columns, cell)
-    place = blocks.transpose(0, 2, 1, 3).reshape(rows, columns, cell * cell).argmax(axis=2)
-    v = np.arange(rows)[:, None] * cell + place // cell
-    u = np.arange(columns)[None, :] * cell + place % cell
-    points = np.column_stack([u.ravel(), v.ravel()]).astype(np.float64)
-    inside = _inside(points, a.camera)
-    points = points[inside]
-    rays = a.camera.intrinsics.rays_from_px(points)
-    rows = _rows(rays, pose, attitude)
+) -> _Steep:
+    """Return those points of a that b shows too, at a similar resolution."""
+    rows = _rows(steep.rays, pose, attitude)
     in_b = b.camera.intrinsics.px_from_rays(rows[:, :, 11])
     finest, coarsest = _stretches(rows[:, :, 9:11])
     ratio = b.camera.intrinsics.focal_px / a.camera.intrinsics.focal_px
     fits = (finest * ratio < options.max_stretch) & (coarsest * ratio > 1.0 / options.max_stretch)
-    return points[fits & _inside(in_b, b.camera)]
+    kept = fits & _inside(in_b, b.camera)
+    return _Steep(steep.points_px[kept], steep.rays[kept], steep.grey[kept])
 
 
 def _stretches(by_rays_a: Floats) -> tuple[Floats, Floats]:
@@ -221,9 +245,19 @@ def _rows(rays_a: Points, pose: Se2, attitude: Floats) -> Floats:
     return rows
 
 
-def _slope(picture: Picture32, right: int, down: int) -> Picture32:
-    """Grey values per pixel along one axis."""
-    return np.asarray(cv2.Scharr(picture, cv2.CV_32F, right, down) / 32.0, dtype=np.float32)
+def _pictured(view: GreyView, blur_px: float) -> Slopes:
+    """Return the picture, blurred, and its grey values per pixel along both axes."""
+    blurred = cv2.GaussianBlur(view.normalised.astype(np.float32), (0, 0), blur_px)
+    slopes = (cv2.Scharr(blurred, cv2.CV_32F, *axis, scale=1 / 32.0) for axis in ((1, 0), (0, 1)))
+    return Slopes(*(np.asarray(made, dtype=np.float32) for made in (blurred, *slopes)))
+
+
+def _lens(intrinsics: Intrinsics, rays: Points) -> Lens:
+    """Return the lens as it is near rays (n, 2): over a pixel or two it is linear to 0.01 px."""
+    px, units = intrinsics.px_from_rays(rays), RAY_STEP * np.eye(2)
+    beside = [intrinsics.px_from_rays(rays + unit) for unit in units]
+    by_ray = np.stack([(moved - px) / RAY_STEP for moved in beside], axis=2)
+    return Lens(rays.copy(), np.ascontiguousarray(px), by_ray)
 
 
 def _inside(points_px: Points, camera: Camera) -> Mask:
@@ -239,49 +273,16 @@ def _inside(points_px: Points, camera: Camera) -> Mask:
     return inside
 
 
-def _sampled(picture: Picture32, points_px: Points) -> Floats:
-    u, v = np.nan_to_num(points_px.T, nan=-1e4).astype(np.float32)
-    values = cv2.remap(picture, u[None], v[None], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    sampled: Floats = values[0].astype(np.float64)
-    return sampled
-
-
 def _linearised(
-    rays_a: Points,
-    wanted: Floats,
-    picture_b: Picture32,
-    slopes: list[Picture32],
-    lens: Intrinsics,
+    points: _Steep,
+    pictured: Slopes,
+    lens: Lens,
     pose: Se2,
     attitude: Floats,
     light: Floats,
 ) -> tuple[Floats, Floats]:
     """Grey residuals (n,) and their Jacobian (n, 11): motion, attitudes, gain, offset."""
-    rows = _rows(rays_a, pose, attitude)
-    rays_b = rows[:, :, 11]
-    px = lens.px_from_rays(rays_b)
-    lost = ~np.isfinite(px).all(axis=1)
-    by_ray = np.stack(
-        [(lens.px_from_rays(rays_b + RAY_STEP * unit) - px) / RAY_STEP for unit in np.eye(2)],
-        axis=2,
-    )
-    slope = np.stack([_sampled(s, px) for s in slopes], axis=1)
-    by_light = np.stack([-wanted, -np.ones_like(wanted)], axis=1)
-    along = np.einsum("ni,nij->nj", slope, by_ray)
-    by_nine: Floats = np.einsum("ni,nij->nj", along, rows[:, :, :9])
-    jacobian = np.column_stack([by_nine, by_light])
-    error: Floats = _sampled(picture_b, px) - light[0] * wanted - light[1]
-    error[lost], jacobian[lost] = 0.0, 0.0
+    rows = _rows(points.rays, pose, attitude)
+    error, jacobian = np.empty(len(rows)), np.empty((len(rows), 11))
+    linearise(pictured, lens, rows, points.grey, light, error, jacobian)
     return error, jacobian
-
-
-def _step(
-    error: Floats, jacobian: Floats, weight: Floats, sigma: Floats, pull: Floats
-) -> tuple[Floats, Floats]:
-    hessian = (jacobian * weight[:, None]).T @ jacobian
-    gradient = jacobian.T @ (weight * error)
-    hessian[3:9, 3:9] += np.diag(1.0 / sigma**2)
-    gradient[3:9] -= pull / sigma**2
-    hessian[np.diag_indices(11)] += 1e-9
-    step: Floats = -np.linalg.solve(hessian, gradient).astype(np.float64)
-    return hessian, step
