@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
-from groundfuse.backend.measurement import Attitude, FrameId, Se2
+from groundfuse.backend.measurement import IDENTITY, Attitude, FrameId, Se2
 from groundfuse.backend.option_checks import check_numbers
 from groundfuse.frontend.arrays import Points
 from groundfuse.frontend.camera import Camera
@@ -57,7 +57,13 @@ def floor_outline(
     camera: Camera, attitude: Attitude, team_from_foot: Se2, overhead: OverheadOptions
 ) -> Points:
     """Return the convex outline (n, 2) of the floor that features come from, m; empty for none."""
-    found = footprint(camera, attitude, team_from_foot)
+    return team_from_foot.apply(_seen_outline(camera, attitude, overhead))
+
+
+@functools.lru_cache(maxsize=64)
+def _seen_outline(camera: Camera, attitude: Attitude, overhead: OverheadOptions) -> Points:
+    """Return the outline as its foot sees it, which all frames of one attitude share."""
+    found = footprint(camera, attitude, IDENTITY)
     limit_m = overhead.max_footprint_cells * raster_cell_m(camera, overhead)
     with np.errstate(invalid="ignore"):
         useful = found.m_per_px <= limit_m
