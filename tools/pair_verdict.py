@@ -76,7 +76,8 @@ def pair_job(a: Spot, b: Spot, options: FrontEndOptions) -> PairJob:
     known = [_key_of_view(v.prior.mean, v.prior.sigma, v.base_from_foot) for v in views]
     match = options.paper if options.matcher is Matcher.PAPER else options.match
     how = _key_of_method(match, options.motion)
-    return PairJob(*views, gate, widened, looks, key_of("pair", how, looks, known, gate, widened))
+    rests_on = b"".join((how, *looks, *known))  # digests of one length each
+    return PairJob(*views, gate, widened, looks, key_of("pair", rests_on, gate, widened))
 
 
 @functools.lru_cache(maxsize=4)
