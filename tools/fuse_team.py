@@ -1,6 +1,7 @@
 """Fuse the photographs of a team of robots into one map: `fuse_team.py --robots A B`."""
 
 import argparse
+import gc
 import logging
 import math
 import os
@@ -83,6 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     asked = parser().parse_args(arguments)
     logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.INFO)
     cv2.setNumThreads(1)
+    gc.freeze()  # what imports have made stays: no search for garbage goes through it again
     try:
         run(asked)
     except TeamError as error:
