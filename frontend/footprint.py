@@ -4,14 +4,13 @@ import functools
 import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from groundfuse.backend.measurement import Attitude, Se2
-from groundfuse.frontend.area_remap import singular_values
 from groundfuse.frontend.arrays import Floats, Points
 from groundfuse.frontend.camera import Camera
-from groundfuse.frontend.overhead import floor_from_rays
+from groundfuse.frontend.footprint_compiled import fill_bounds, fill_seen_floor
+from groundfuse.frontend.overhead import foot_from_cam
 
 LATTICE_COLUMNS = 33
 LATTICE_ROWS = 49
@@ -46,14 +45,9 @@ class Footprint:
 
     def bounds(self, limit_m: float) -> tuple[Points, Points] | None:
         """Return the lowest and highest (x, y) of the floor resolved within the limit, or None."""
-        with np.errstate(invalid="ignore"):
-            useful = self.m_per_px <= limit_m
-            near = self.m_per_px <= limit_m * BEYOND
-        if not useful.any():
-            return None
-        around = cv2.dilate(useful.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-        x, y = self.floor_m[useful | (near & around)].T.copy()  # one after the other: far quicker
-        return np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
+        found = np.array([[math.inf, math.inf], [-math.inf, -math.inf]])
+        fill_bounds(self.floor_m, self.m_per_px, (limit_m, limit_m * BEYOND), found)
+        return None if np.isinf(found[0, 0]) else (found[0], found[1])
 
 
 @functools.lru_cache(maxsize=64)
@@ -98,10 +92,11 @@ def _seen_floor(camera: Camera, attitude: Attitude) -> tuple[Floats, Floats]:
     Before a bundle all frames of a robot that stands level share one attitude.
     """
     rays, v, u = _lattice(camera)
-    lattice = floor_from_rays(attitude, rays).reshape(len(v), len(u), 2)
-    by_v = np.asarray(np.gradient(lattice, v, axis=0), dtype=np.float64)
-    by_u = np.asarray(np.gradient(lattice, u, axis=1), dtype=np.float64)
-    longest, _ = singular_values(by_u, by_v)
+    lattice, longest = np.empty((len(v), len(u), 2)), np.empty((len(v), len(u)))
+    turn = foot_from_cam(attitude.tilt_rad, attitude.roll_rad)
+    steps_px = float(v[1] - v[0]), float(u[1] - u[0])
+    every = rays.reshape(lattice.shape)
+    fill_seen_floor(every, turn, attitude.height_m, steps_px, (lattice, longest))
     for shared in (lattice, longest):
         shared.flags.writeable = False
     return lattice, longest
