@@ -7,7 +7,7 @@ as they would have been.
 """
 
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -17,7 +17,13 @@ from numpy.typing import NDArray
 from groundfuse.frontend.arrays import Floats
 from groundfuse.frontend.exposure_samples import ViewSamples
 from groundfuse.frontend.gains import Exposure, neutral_exposure
-from groundfuse.frontend.made_from import MadeFrom, is_same, made_from
+from groundfuse.frontend.made_from import (
+    MadeFrom,
+    is_same,
+    made_from,
+    same_views,
+    stacked,
+)
 from groundfuse.frontend.mosaic_options import MosaicOptions
 from groundfuse.frontend.mosaic_plan import Block, Extent, MosaicPlan
 from groundfuse.frontend.mosaic_tile import Tile
@@ -31,6 +37,10 @@ class Memory(Protocol):
 
     def load(self, name: str) -> object:
         """Return what was saved last by that name; None where nothing was."""
+
+    def load_all(self, names: Sequence[str]) -> Iterable[object]:
+        """Return what `load` returns for each of many names: a question for each costs more."""
+        ...
 
     def save(self, name: str, part: object) -> None:
         """Keep a part in place of what had its name."""
@@ -97,27 +107,44 @@ class Keeper:
             ValueError: there is a memory, and a view whose picture it can't know again.
         """
         self._plan, self._options, self._memory = plan, options, memory
+        self._sampling = "samples", plan.grid.m_per_px, plan.layout.sampling_cells
+        self._neutral = neutral_exposure(len(plan.views))  # samples have no gain
         for view in plan.views:
             if memory is not None and not view.digest:
                 raise ValueError(f"a mosaic that is kept needs a digest of picture {view.frame}")
 
-    def samples(self, extent: Extent, work: Callable[[], ViewSamples]) -> ViewSamples:
-        """Return the samples of one view, made now if need be."""
+    def kept_samples(self) -> list[ViewSamples | None]:
+        """Return the samples of each extent's view that may stay, None for the others."""
+        extents = self._plan.extents
+        found: list[ViewSamples | None] = [None] * len(extents)
         if self._memory is None:
-            return work()
-        plan = self._plan
-        name, neutral = f"samples of {plan.views[extent.view].frame}", neutral_exposure(1)
-        settings = "samples", plan.grid.m_per_px, plan.layout.sampling_cells
-        one = np.zeros(len(plan.views), np.int64)  # whatever the view: samples have no gain
-        every = Exposure(neutral.log_gain[one], neutral.falloff[one], neutral.noise_levels)
-        today = made_from(plan, [extent.view], every, settings)
-        kept = self._memory.load(name)
-        part = extent.rows, extent.columns
-        if isinstance(kept, KeptSamples) and self._is_same(kept.made_from, today, [part]):
-            return kept.samples
-        found = work()
-        self._memory.save(name, KeptSamples(today, found))
+            return found
+        kept = dict[int, KeptSamples]()
+        for k, part in enumerate(self._memory.load_all([self._name(extent) for extent in extents])):
+            if isinstance(part, KeptSamples) and part.made_from.settings == self._sampling:
+                kept[k] = part
+        if kept:
+            today = self._samples_made_from([extents[k] for k in kept])
+            before = stacked([part.made_from for part in kept.values()])
+            corners_m = self._corners_m([(extents[k].rows, extents[k].columns) for k in kept])
+            cell_m = self._plan.grid.m_per_px
+            same = same_views(before, today, corners_m, cell_m, self._options)
+            for (k, part), stays in zip(kept.items(), same, strict=True):
+                found[k] = part.samples if stays else None
         return found
+
+    def keep_samples(self, extent: Extent, samples: ViewSamples) -> None:
+        """Keep the samples of an extent's view."""
+        if self._memory is not None:
+            today = self._samples_made_from([extent])
+            self._memory.save(self._name(extent), KeptSamples(today, samples))
+
+    def _name(self, extent: Extent) -> str:
+        return f"samples of {self._plan.views[extent.view].frame}"
+
+    def _samples_made_from(self, extents: Sequence[Extent]) -> MadeFrom:
+        views = [extent.view for extent in extents]
+        return made_from(self._plan, views, self._neutral, self._sampling)
 
     def tile(
         self,
@@ -144,15 +171,14 @@ class Keeper:
         name = f"tile {at[0] // side} {at[1] // side}"
         parts = [extent.within(*block) or block for extent in shown]
         kept = self._memory.load(name)
-        if isinstance(kept, KeptTile) and self._is_same(kept.made_from, today, parts):
+        limits = grid.m_per_px, options
+        if isinstance(kept, KeptTile) and is_same(
+            kept.made_from, today, self._corners_m(parts), *limits
+        ):
             return None if kept.tile is None else unpacked_tile(kept.tile)
         found = work()
         self._memory.save(name, KeptTile(today, None if found is None else packed_tile(found)))
         return found
-
-    def _is_same(self, kept: MadeFrom, today: MadeFrom, parts: Sequence[Block]) -> bool:
-        cell_m = self._plan.grid.m_per_px
-        return is_same(kept, today, self._corners_m(parts), cell_m, self._options)
 
     def _corners_m(self, parts: Sequence[Block]) -> Floats:
         """Return the corners (n, 4, 2) of blocks of cells."""

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from groundfuse.backend.measurement import Attitude, Se2
-from groundfuse.frontend.arrays import Floats, Matrix
+from groundfuse.frontend.arrays import Floats, Mask, Matrix
 from groundfuse.frontend.camera import Intrinsics
 from groundfuse.frontend.gains import Exposure
 from groundfuse.frontend.gains_compiled import POWERS
@@ -87,6 +87,20 @@ def made_from(
     )
 
 
+def stacked(records: Sequence[MadeFrom]) -> MadeFrom:
+    """Return several records of one view each, all with the same settings and noise, as one."""
+    return MadeFrom(
+        records[0].settings,
+        tuple(record.who[0] for record in records),
+        tuple(record.lenses[0] for record in records),
+        np.arange(len(records)),
+        np.concatenate([record.place for record in records]),
+        np.concatenate([record.limit_m for record in records]),
+        np.concatenate([record.colour for record in records]),
+        records[0].noise_levels,
+    )
+
+
 def is_same(
     kept: MadeFrom, today: MadeFrom, corners_m: Floats, cell_m: float, options: MosaicOptions
 ) -> bool:
@@ -99,38 +113,45 @@ def is_same(
         cell_m: side of a cell.
         options: how much may change.
     """
-    same = (
-        kept.settings == today.settings
-        and kept.who == today.who
-        and np.array_equal(kept.limit_m, today.limit_m)
-    )
-    return (
-        same
-        and _is_same_place(kept, today, corners_m, options.keep_within_cells * cell_m)
-        and _is_same_colour(kept, today, options)
-    )
-
-
-def _is_same_place(kept: MadeFrom, today: MadeFrom, corners_m: Floats, allowed_m: float) -> bool:
-    lenses = [
-        (kept.lenses[old], today.lenses[new])
-        for old, new in zip(kept.lens_of_view, today.lens_of_view, strict=True)
-    ]
-    if np.array_equal(kept.place, today.place) and all(old == new for old, new in lenses):
-        return True
-    bent_m = np.array([_lens_shift_px(*pair) for pair in lenses]) * today.limit_m
-    moved_m = floor_shift_m(kept.place, today.place, corners_m) + bent_m
-    return bool((moved_m <= allowed_m).all()) and allowed_m > 0.0
-
-
-def _is_same_colour(kept: MadeFrom, today: MadeFrom, options: MosaicOptions) -> bool:
-    allowed = options.keep_within_levels
-    powers = RADII2[:, None] ** np.arange(1, POWERS + 1)
-    gain, falloff = np.hsplit(today.colour - kept.colour, [3])
-    change = np.abs(gain[:, None, :] + (falloff @ powers.T)[:, :, None])
     sigmas = options.num_sigmas if np.isfinite(options.num_sigmas) else 0.0
     noise = abs(today.noise_levels - kept.noise_levels) * sigmas
-    return max(float(change.max(initial=0.0)) * MIDDLE_GREY, noise) <= allowed
+    return (
+        kept.settings == today.settings
+        and kept.who == today.who
+        and noise <= options.keep_within_levels
+        and bool(same_views(kept, today, corners_m, cell_m, options).all())
+    )
+
+
+def same_views(
+    kept: MadeFrom, today: MadeFrom, corners_m: Floats, cell_m: float, options: MosaicOptions
+) -> Mask:
+    """Tell (n,) which views, one by one, may stay; see `is_same`."""
+    same: Mask = np.array([a == b for a, b in zip(kept.who, today.who, strict=True)], bool)
+    same &= kept.limit_m == today.limit_m
+    if same.any():
+        same &= _is_same_place(kept, today, corners_m, options.keep_within_cells * cell_m)
+        same &= _is_same_colour(kept, today, options.keep_within_levels)
+    return same
+
+
+def _is_same_place(kept: MadeFrom, today: MadeFrom, corners_m: Floats, allowed_m: float) -> Mask:
+    numbers = zip(kept.lens_of_view, today.lens_of_view, strict=True)
+    bent_px = np.array([_lens_shift_px(kept.lenses[a], today.lenses[b]) for a, b in numbers])
+    still: Mask = (kept.place == today.place).all(axis=1) & (bent_px == 0.0)
+    if still.all() or allowed_m == 0.0:
+        return still
+    moved_m = floor_shift_m(kept.place, today.place, corners_m) + bent_px * today.limit_m
+    near: Mask = still | (moved_m <= allowed_m)
+    return near
+
+
+def _is_same_colour(kept: MadeFrom, today: MadeFrom, allowed_levels: float) -> Mask:
+    powers = RADII2[:, None] ** np.arange(1, POWERS + 1)
+    gain, falloff = np.hsplit(today.colour - kept.colour, [3])
+    change = np.abs(gain[:, None, :] + (falloff @ powers.T)[:, :, None]).max(axis=(1, 2))
+    near: Mask = change * MIDDLE_GREY <= allowed_levels
+    return near
 
 
 def floor_shift_m(kept: Floats, today: Floats, points_m: Floats) -> Floats:

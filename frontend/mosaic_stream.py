@@ -141,15 +141,20 @@ def _exposure(
 ) -> Exposure:
     cell_m = sampling_grid(plan).m_per_px
 
-    def work(number: int) -> ViewSamples:
-        extent = plan.extents[number]
-        return keeper.samples(
-            extent, lambda: sample_exposure(plan, number, _picture(plan, extent.view, cell_m))
-        )
+    kept = keeper.kept_samples()
 
+    def work(number: int) -> ViewSamples:
+        """Sample one view."""
+        extent = plan.extents[number]
+        samples = sample_exposure(plan, number, _picture(plan, extent.view, cell_m))
+        keeper.keep_samples(extent, samples)
+        return samples
+
+    missing = [number for number, samples in enumerate(kept) if samples is None]
+    made = threads.map(work, missing)
     parts: list[ViewSamples] = []
-    for part in threads.map(work, range(len(plan.extents))):
-        parts.append(part)
+    for samples in kept:
+        parts.append(next(made) if samples is None else samples)
         told.step()
     robots = sorted({view.frame.robot for view in plan.views})
     lens_of_view = np.array([robots.index(view.frame.robot) for view in plan.views])

@@ -35,6 +35,9 @@ class Parts(dict):
     def load(self, name):
         return self.get(name)
 
+    def load_all(self, names):
+        return map(self.get, names)
+
     def save(self, name, part):
         if self.left == 0:
             raise KeyboardInterrupt
@@ -120,6 +123,17 @@ def test_a_new_view_renders_its_own_tiles():
     assert is_equal(made(views, OPTIONS, parts), made(views))
     assert parts.tiles_saved()
     assert every - parts.tiles_saved()
+
+
+def test_only_what_is_new_or_moved_is_sampled():
+    views, parts = team(), Parts()
+    made(views[:-1], LIGHT, parts)
+    parts.saved.clear()
+    first, *others = views
+    other = dataclasses.replace(first, digest=b"another")
+    made(moved(moved([other, *others], 2, 0.2), 3, 0.02), LIGHT, parts)
+    sampled = {name for name in parts.saved if name.startswith("samples")}
+    assert sampled == {f"samples of {views[k].frame}" for k in (0, 2, -1)}
 
 
 @pytest.mark.parametrize(("cells", "stays"), [(0.09, True), (0.11, False)])

@@ -44,6 +44,7 @@ def test_parts_come_back_by_mosaic_and_name():
         memory.of("mosaic").save("layout", LAYOUT)
         assert memory.of("mosaic").load("layout") == LAYOUT
         assert memory.of("mosaic").load("tile 0 0") is None
+        assert list(memory.of("mosaic").load_all(["tile 0 0", "layout"])) == [None, LAYOUT]
         assert memory.of("mosaic_1").load("layout") is None
         assert MosaicMemory(store).of("mosaic").load("layout") == LAYOUT
 

@@ -1,6 +1,7 @@
 """The parts of a team's mosaics in its store: one entry for each place, the latest."""
 
 import threading
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from groundfuse.tools.code_version import code_of
@@ -32,6 +33,10 @@ class MosaicMemory:
         """Return a part of a mosaic, None where there is none."""
         return self._store.load(self._key(mosaic, name))
 
+    def load_all(self, mosaic: str, names: Sequence[str]) -> Iterator[Any]:
+        """Yield many parts of a mosaic, as `load` returns them."""
+        return self._store.load_all([self._key(mosaic, name) for name in names])
+
     def save(self, mosaic: str, name: str, part: object) -> None:
         """Keep a part in place of what had its name (DataError: the disk is full, or fails)."""
         self._store.save(self._key(mosaic, name), KIND, f"{mosaic}: {name}", packed(part))
@@ -56,6 +61,10 @@ class PartMemory:
     def load(self, name: str) -> Any:  # noqa: ANN401
         """Return a part; None where there is none."""
         return self._every.load(self._mosaic, name)
+
+    def load_all(self, names: Sequence[str]) -> Iterator[Any]:
+        """Yield many parts."""
+        return self._every.load_all(self._mosaic, names)
 
     def save(self, name: str, part: object) -> None:
         """Keep a part."""
