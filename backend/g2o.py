@@ -66,18 +66,15 @@ def keyed(
     Edges to frames without a pose are left out.
     """
     some = [e for e in edges if e.a in poses and e.b in poses]
+    every = np.linalg.inv(np.array([e.covariance for e in some]).reshape(-1, 3, 3))
+    upper = np.stack([(every[:, i, j] + every[:, j, i]) / 2.0 for i, j in UPPER], axis=1)
     return Graph(
         {key_of[frame]: poses[frame] for frame in sorted(poses)},
-        tuple(_of_relative_pose(e, key_of[e.a], key_of[e.b]) for e in some),
+        tuple(
+            Edge(key_of[e.a], key_of[e.b], e.a_from_b, (i11, i12, i13, i22, i23, i33))
+            for e, (i11, i12, i13, i22, i23, i33) in zip(some, upper.tolist(), strict=True)
+        ),
     )
-
-
-def _of_relative_pose(edge: RelativePose, a: int, b: int) -> Edge:
-    information = np.linalg.inv(edge.covariance)
-    i11, i12, i13, i22, i23, i33 = (
-        float(information[i, j] + information[j, i]) / 2.0 for i, j in UPPER
-    )
-    return Edge(a, b, edge.a_from_b, (i11, i12, i13, i22, i23, i33))
 
 
 def relative_pose(edge: Edge, frame_of: Mapping[int, FrameId]) -> RelativePose:

@@ -9,15 +9,22 @@ from groundfuse.tools.store import Store
 
 
 def unless_finished(
-    store: Store, out: Path, kind: str, parts: Sequence[object], work: Callable[[], None]
+    store: Store,
+    out: Path,
+    kind: str,
+    parts: Sequence[object],
+    names: Sequence[str],
+    work: Callable[[], None],
 ) -> set[str]:
     """Do work that writes files, unless all it would write lies there as it left it.
 
     Args:
         store: remembers which files the work wrote, and their digests.
-        out: where it writes them, there and in folders one below.
+        out: where it writes them.
         kind: what it makes.
         parts: all that the files depend on.
+        names: patterns for the names of the files, seen from `out`: whatever else is written there
+            meanwhile is not of the work.
         work: writes them.
 
     Returns:
@@ -27,9 +34,9 @@ def unless_finished(
     known: dict[str, bytes] | None = store.load(key)
     if known is not None and all(_digest(out / name) == known[name] for name in known):
         return set(known)
-    before = _stamps(out)
+    before = _stamps(out, names)
     work()
-    after = _stamps(out)
+    after = _stamps(out, names)
     written = sorted(name for name, stamp in after.items() if before.get(name) != stamp)
     digests = {name: _digest(out / name) for name in written}
     store.save(key, kind, "files", packed(digests))
@@ -45,12 +52,10 @@ def _digest(path: Path) -> bytes | None:
         return None
 
 
-def _stamps(out: Path) -> dict[str, tuple[int, int, int]]:
+def _stamps(out: Path, names: Sequence[str]) -> dict[str, tuple[int, int, int]]:
     """Return what tells a rewritten file from an old one: number, size and time."""
     found = {}
-    for path in (*out.glob("*"), *out.glob("*/*")):
-        if path.is_file() and ".sqlite" not in path.name:
-            stat = path.stat()
-            name = path.relative_to(out).as_posix()
-            found[name] = (stat.st_ino, stat.st_size, stat.st_mtime_ns)
+    for path in (path for name in names for path in out.glob(name)):
+        stat = path.stat()
+        found[path.relative_to(out).as_posix()] = (stat.st_ino, stat.st_size, stat.st_mtime_ns)
     return found

@@ -7,7 +7,8 @@ import math
 import os
 import sys
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -66,6 +67,9 @@ from groundfuse.tools.view3d import view_ply, write_ply
 from groundfuse.tools.workers import Threads, Workers
 
 log = logging.getLogger(__name__)
+
+MOSAIC_FILES = "*.png", "*.pgw", "*.tif", "*.ply"
+"""What comes with a mosaic."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -158,20 +162,22 @@ def _fused(desk: _Desk, robots: Sequence[Robot], workers: Workers) -> tuple[Fuse
         store=desk.store,
         workers=workers,
     )
-    drift = drift_record(fused)
-    _write_numbers(desk.out, fused, drift, watch)
     notes = [fused.front_end.reused.line()]
     old: set[str] = set()
-    try:
-        old |= _write_pictures(desk, fused)
-        if asked.check:
-            with watch.stage("check"):
-                notes.append(_second_opinion(fused))
-    finally:  # a picture that fails late doesn't cost the numbers
-        table = closing_table(fused, drift, watch.seconds)
-        table += "".join(f"{note}\n" for note in notes if note)
-        write_atomic(desk.out / "report.txt", table)
-        print(table, end="")
+    with ThreadPoolExecutor(1) as beside:
+        numbers = beside.submit(_write_numbers, desk.out, fused)
+        try:
+            old |= _write_pictures(desk, fused)
+            if asked.check:
+                with watch.stage("check"):
+                    notes.append(_second_opinion(fused))
+        finally:  # a picture that fails late doesn't cost the numbers
+            with watch.stage("writing"):
+                drift = numbers.result()
+            table = closing_table(fused, drift, watch.seconds)
+            table += "".join(f"{note}\n" for note in notes if note)
+            write_atomic(desk.out / "report.txt", table)
+            print(table, end="")
     return fused, old
 
 
@@ -184,16 +190,18 @@ def _interrupted(asked: argparse.Namespace) -> str:
     return f"interrupted; what was finished is in {store}, {same} goes on from there"
 
 
-def _write_numbers(out: Path, fused: Fused, drift: Mapping[str, Any], watch: Stopwatch) -> None:
-    with watch.stage("writing"):
-        write_pairs(out, fused)
-        write_poses(out, fused)
-        write_attitudes(out, fused)
-        if isinstance(fused.bundled, BundleEstimate):
-            write_calibrations(out, fused.robots, fused.bundled)
-        write_graphs(out, fused)
-        write_trajectories(out, fused)
-        write_json(out / "drift.json", drift)
+def _write_numbers(out: Path, fused: Fused) -> dict[str, Any]:
+    """Write everything but pictures; return the record of the drift."""
+    drift = drift_record(fused)
+    write_pairs(out, fused)
+    write_poses(out, fused)
+    write_attitudes(out, fused)
+    if isinstance(fused.bundled, BundleEstimate):
+        write_calibrations(out, fused.robots, fused.bundled)
+    write_graphs(out, fused)
+    write_trajectories(out, fused)
+    write_json(out / "drift.json", drift)
+    return drift
 
 
 def _write_pictures(desk: _Desk, fused: Fused) -> set[str]:
@@ -213,11 +221,14 @@ def _write_pictures(desk: _Desk, fused: Fused) -> set[str]:
             desk.out,
             "mosaic",
             (*rests_on, options.mosaic),
+            MOSAIC_FILES,
             lambda: _write_mosaics(desk, fused),
         )
     if asked.overhead:
         rests_on = (*rests_on, options.front_end.features.overhead)
-        old |= unless_finished(desk.store, desk.out, "overhead", rests_on, overheads)
+        old |= unless_finished(
+            desk.store, desk.out, "overhead", rests_on, ("overhead/*.png",), overheads
+        )
     return old
 
 
