@@ -6,14 +6,11 @@ import math
 import numpy as np
 import pytest
 from analytic_floor import make_camera, ring, rounded, view_of, waves
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from groundfuse.backend.measurement import Attitude, FrameId, Se2
-from groundfuse.frontend import kept_parts, made_from
+from groundfuse.frontend import made_from
 from groundfuse.frontend.mosaic import MosaicOptions, planned_mosaic
 from groundfuse.frontend.mosaic_plan import Layout, plan_mosaic
-from groundfuse.frontend.mosaic_tile import Tile
 from groundfuse.frontend.overhead import floor_from_rays, rays_from_floor
 
 CAMERA = make_camera(30.0)
@@ -244,19 +241,6 @@ def test_a_memory_needs_digests():
     made(views[:2], OPTIONS, Parts())
     with pytest.raises(ValueError, match="a mosaic that is kept needs a digest of picture A7"):
         made(views, OPTIONS, Parts())
-
-
-@settings(max_examples=20)
-@given(st.integers(1, 20), st.integers(1, 20), st.integers(0, 10**6))
-def test_a_packed_tile_comes_back(rows, columns, seed):
-    rng = np.random.default_rng(seed)
-    colours = rng.integers(0, 256, (2, rows, columns, 3)).astype(np.uint8)
-    tile = Tile(*colours, rng.integers(0, 2**16, (rows, columns)).astype(np.uint16))
-    found = kept_parts.unpacked_tile(kept_parts.packed_tile(tile))
-    for layer in ("floor", "mean", "count"):
-        value = getattr(found, layer)
-        assert value.dtype == getattr(tile, layer).dtype
-        assert np.array_equal(value, getattr(tile, layer))
 
 
 def numbers(foot, attitude):
