@@ -17,6 +17,7 @@ from groundfuse.frontend.exposure_samples import ViewSamples
 from groundfuse.frontend.gains import Exposure, neutral_exposure
 from groundfuse.frontend.made_from import (
     MadeFrom,
+    every_view,
     is_same,
     made_from,
     same_views,
@@ -70,6 +71,7 @@ class Keeper:
             ValueError: there is a memory, and a view whose picture it can't know again.
         """
         self._plan, self._options, self._memory = plan, options, memory
+        self._every = every_view(plan)
         self._sampling = "samples", plan.grid.m_per_px, plan.layout.sampling_cells
         self._neutral = neutral_exposure(len(plan.views))  # samples have no gain
         for view in plan.views:
@@ -107,7 +109,7 @@ class Keeper:
 
     def _samples_made_from(self, extents: Sequence[Extent]) -> MadeFrom:
         views = [extent.view for extent in extents]
-        return made_from(self._plan, views, self._neutral, self._sampling)
+        return made_from(self._every, views, self._neutral, self._sampling)
 
     def tile(
         self,
@@ -130,7 +132,7 @@ class Keeper:
         side, options = self._options.tile_cells, self._options
         at = row + block[0].start, column + block[1].start
         settings = "tile", grid.m_per_px, at, side, options.max_depth, options.num_sigmas
-        today = made_from(self._plan, [extent.view for extent in shown], exposure, settings)
+        today = made_from(self._every, [extent.view for extent in shown], exposure, settings)
         name = f"tile {at[0] // side} {at[1] // side}"
         parts = [extent.within(*block) or block for extent in shown]
         kept = self._memory.load(name)

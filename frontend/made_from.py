@@ -56,33 +56,48 @@ class MadeFrom:
     noise_levels: float
 
 
-def made_from(
-    plan: MosaicPlan, views: Sequence[int], exposure: Exposure, settings: tuple[object, ...]
-) -> MadeFrom:
-    """Describe what a part is made from today.
-
-    Args:
-        plan: of the mosaic.
-        views: numbers of those that the part shows.
-        exposure: of all views.
-        settings: what else the part depends on.
-    """
-    chosen = [plan.views[number] for number in views]
-    lenses = [(view.camera.intrinsics, *view.camera.used_rows) for view in chosen]
-    distinct = tuple(dict.fromkeys(lenses))
-    feet = [(view.team_from_foot, view.attitude) for view in chosen]
+def every_view(plan: MosaicPlan) -> MadeFrom:
+    """Describe all views of a plan, as a part that shows them all, without light or settings."""
+    lenses = [(view.camera.intrinsics, *view.camera.used_rows) for view in plan.views]
+    number = {lens: k for k, lens in enumerate(dict.fromkeys(lenses))}
+    feet = [(view.team_from_foot, view.attitude) for view in plan.views]
     place = [
         (foot.x_m, foot.y_m, foot.theta_rad, seen.tilt_rad, seen.roll_rad, seen.height_m)
         for foot, seen in feet
     ]
     return MadeFrom(
+        (),
+        tuple(f"{v.frame.robot} {v.frame.index} {v.digest.hex()}" for v in plan.views),
+        tuple(number),
+        np.array([number[lens] for lens in lenses]),
+        np.array(place),
+        np.array(plan.limit_m),
+        np.zeros((len(lenses), 6)),
+        0.0,
+    )
+
+
+def made_from(
+    every: MadeFrom, views: Sequence[int], exposure: Exposure, settings: tuple[object, ...]
+) -> MadeFrom:
+    """Describe what a part is made from today.
+
+    Args:
+        every: see `every_view`.
+        views: numbers of those that the part shows.
+        exposure: of all views.
+        settings: what else the part depends on.
+    """
+    chosen = list(views)
+    lenses, lens_of_view = np.unique(every.lens_of_view[chosen], return_inverse=True)
+    return MadeFrom(
         settings,
-        tuple(f"{v.frame.robot} {v.frame.index} {v.digest.hex()}" for v in chosen),
-        distinct,
-        np.array([distinct.index(lens) for lens in lenses], np.int64),
-        np.array(place, np.float64).reshape(-1, 6),
-        np.array([plan.limit_m[number] for number in views], np.float64),
-        np.hstack([exposure.log_gain[list(views)], exposure.falloff[list(views)]]),
+        tuple(every.who[k] for k in chosen),
+        tuple(every.lenses[k] for k in lenses),
+        lens_of_view,
+        every.place[chosen],
+        every.limit_m[chosen],
+        np.hstack([exposure.log_gain[chosen], exposure.falloff[chosen]]),
         exposure.noise_levels,
     )
 
@@ -136,8 +151,9 @@ def same_views(
 
 
 def _is_same_place(kept: MadeFrom, today: MadeFrom, corners_m: Floats, allowed_m: float) -> Mask:
-    numbers = zip(kept.lens_of_view, today.lens_of_view, strict=True)
-    bent_px = np.array([_lens_shift_px(kept.lenses[a], today.lenses[b]) for a, b in numbers])
+    pairs = list(zip(kept.lens_of_view.tolist(), today.lens_of_view.tolist(), strict=True))
+    shift_px = {(a, b): _lens_shift_px(kept.lenses[a], today.lenses[b]) for a, b in set(pairs)}
+    bent_px = np.array([shift_px[pair] for pair in pairs])
     still: Mask = (kept.place == today.place).all(axis=1) & (bent_px == 0.0)
     if still.all() or allowed_m == 0.0:
         return still
