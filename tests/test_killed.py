@@ -93,6 +93,15 @@ def test_interrupted_it_says_so_in_one_line_and_goes_on(undisturbed, tmp_path, s
     assert content(out) == wanted
 
 
+def test_interrupted_amid_its_imports_it_ends_without_a_word(tmp_path, monkeypatch):
+    stand_in = "import os, signal, time\nos.kill(os.getpid(), signal.SIGINT)\ntime.sleep(30)\n"
+    (tmp_path / "cv2.py").write_text(stand_in)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    process = start(tmp_path / "out", preexec_fn=heeding_ctrl_c)
+    text, _ = process.communicate(timeout=25)
+    assert (process.returncode, text) == (-signal.SIGINT, "")
+
+
 def test_what_an_interrupted_run_leaves_is_told(tmp_path, capsys, monkeypatch):
     def stopped(*_, **__):
         raise KeyboardInterrupt

@@ -5,6 +5,7 @@ import gc
 import logging
 import math
 import os
+import signal
 import sys
 import time
 from collections.abc import Iterable, Sequence
@@ -13,6 +14,9 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
+
+if __name__ == "__main__" and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C amid the imports: the end, no traceback
 
 # Threads work on frames and pairs; a second layer of them inside numpy would only get in the way.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -292,4 +296,6 @@ class _Bar:
 
 
 if __name__ == "__main__":
+    if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     sys.exit(main())
