@@ -10,6 +10,9 @@ Indices = NDArray[np.int64]
 Cast = NDArray[np.float64]
 CHUNK = 256
 """Frames whose likeness to all others is held at a time."""
+TOGETHER = 8
+"""Candidates whose features are compared at a time: in memory that is used again, as threads that
+ask for new memory wait for each other."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,8 +62,14 @@ def cast(voter: Short, others: Short, num_votes: int) -> Cast:
     much nearer they are than the next: what looks like everything tells nothing.
     """
     count, size, width = others.shape
-    likeness = (others.reshape(count * size, width) @ voter.T).reshape(count, size, size)
-    value = np.maximum(np.ascontiguousarray(likeness.max(axis=1).T), 0.0) ** 2
+    nearest = np.empty((count, size), np.float32)
+    likeness = np.empty((min(TOGETHER, count), size, size), np.float32)
+    for start in range(0, count, TOGETHER):
+        some = others[start : start + TOGETHER]
+        part = likeness[: len(some)]
+        np.matmul(some.reshape(-1, width), voter.T, out=part.reshape(-1, size))
+        part.max(axis=1, out=nearest[start : start + TOGETHER])
+    value = np.maximum(np.ascontiguousarray(nearest.T), 0.0) ** 2
     if count > num_votes:
         next_best = np.partition(value, count - 1 - num_votes, axis=1)[:, count - 1 - num_votes]
         value = np.maximum(value - next_best[:, None], 0.0)
