@@ -103,7 +103,8 @@ def test_layers_decode_to_what_they_show(made):
 
 
 def test_counts_too_high_for_a_grey_value_stay_white(tmp_path):
-    pictures._write_layers(tmp_path, "x", small_mosaic(), 2)
+    for write in pictures._layers(tmp_path, "x", small_mosaic()):
+        write()
     assert decoded(tmp_path / "x_count.png").tolist() == [[0, 16, 32], [48, 240, 255]]
     assert decoded(tmp_path / "x_few.png").tolist() == [[0, 255, 255], [0, 0, 0]]
 
@@ -177,12 +178,14 @@ def test_more_is_written_beside_a_mosaic_and_its_failure_is_told(tmp_path):
     def fail(component, _):
         raise DataError(f"no room for {component}")
 
-    how = {"quiet": True, "beside": (note,)}
-    mosaics = pictures.write_mosaics(tmp_path, fused, MOSAIC, 2, watch, **how)
-    assert seen == list(mosaics.items())
-    how["beside"] = (note, fail)
-    with pytest.raises(DataError, match="no room for 0"):
-        pictures.write_mosaics(tmp_path, fused, MOSAIC, 2, watch, **how)
+    for kind in ("longer", "shorter"):
+        seen.clear()
+        how = {"quiet": True, kind: (note,)}
+        mosaics = pictures.write_mosaics(tmp_path, fused, MOSAIC, 2, watch, **how)
+        assert seen == list(mosaics.items())
+        how[kind] = (note, fail)
+        with pytest.raises(DataError, match="no room for 0"):
+            pictures.write_mosaics(tmp_path, fused, MOSAIC, 2, watch, **how)
 
 
 def test_what_a_mosaic_refuses_is_one_line_that_names_the_part(tmp_path):

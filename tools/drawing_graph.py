@@ -59,7 +59,7 @@ class Placing:
 
 def draw_graph(canvas: Canvas, graph: Graph, placing: Placing) -> None:
     """Draw edges, ellipses, trajectories, headings and numbers, the important last."""
-    at = {frame: placing.of(pose) for frame, pose in graph.poses.items()}
+    at = dict(zip(graph.poses, placing.px(graph.places()), strict=True))
     colour = {frame: _colour(graph, frame) for frame in graph.poses}
     for kind in EdgeKind:
         for a, b in graph.edges[kind]:
@@ -88,8 +88,8 @@ def marker_px(graph: Graph, px_per_m: float) -> float:
 
 def exaggeration(graph: Graph, px_per_m: float) -> float:
     """Return the round number, at least 1, that makes the largest ellipse easily seen."""
-    largest = [math.sqrt(float(np.linalg.eigvalsh(c)[-1])) for c in graph.covariance.values()]
-    radius_m = NUM_SIGMAS * max(largest, default=0.0)
+    every = np.array(list(graph.covariance.values())).reshape(-1, 2, 2)
+    radius_m = NUM_SIGMAS * math.sqrt(float(np.linalg.eigvalsh(every).max(initial=0.0)))
     wanted_m = ELLIPSE_MARKERS * marker_px(graph, px_per_m) / px_per_m
     return round_below(wanted_m / radius_m) if wanted_m > radius_m > 0.0 else 1.0
 

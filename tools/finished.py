@@ -1,7 +1,8 @@
 """Files that an earlier run left and that need not be made again."""
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from groundfuse.tools.packing import key_of, packed
@@ -32,15 +33,20 @@ def unless_finished(
     """
     key = key_of(kind, *parts)
     known: dict[str, bytes] | None = store.load(key)
-    if known is not None and all(_digest(out / name) == known[name] for name in known):
+    if known is not None and _digests(out, known) == known:
         return set(known)
     before = _stamps(out, names)
     work()
     after = _stamps(out, names)
     written = sorted(name for name, stamp in after.items() if before.get(name) != stamp)
-    digests = {name: _digest(out / name) for name in written}
-    store.save(key, kind, "files", packed(digests))
+    store.save(key, kind, "files", packed(_digests(out, written)))
     return set()
+
+
+def _digests(out: Path, names: Collection[str]) -> dict[str, bytes | None]:
+    """Return the digest of each file."""
+    with ThreadPoolExecutor() as threads:
+        return dict(zip(names, threads.map(lambda name: _digest(out / name), names), strict=True))
 
 
 def _digest(path: Path) -> bytes | None:

@@ -254,7 +254,8 @@ def _write_mosaics(desk: _Desk, fused: Fused) -> None:
         desk.watch,
         quiet=desk.asked.quiet,
         store=desk.store,
-        beside=(draw, put_down),
+        longer=(draw,),
+        shorter=(put_down,),
     )
 
 

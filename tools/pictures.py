@@ -50,7 +50,8 @@ def write_mosaics(
     *,
     quiet: bool,
     store: Store | None = None,
-    beside: Sequence[Callable[[int, Mosaic], None]] = (),
+    longer: Sequence[Callable[[int, Mosaic], None]] = (),
+    shorter: Sequence[Callable[[int, Mosaic], None]] = (),
 ) -> dict[int, Mosaic]:
     """Build and write the mosaic of every component with its layers; return them by component.
 
@@ -65,7 +66,8 @@ def write_mosaics(
         watch: takes the seconds.
         quiet: without a progress bar.
         store: has the tiles of the team's last mosaics, and takes these; see `mosaic_tiles`.
-        beside: write more of a component and its mosaic, while the layers are being written.
+        longer: write more of a component and its mosaic, beside the layers; begun before them.
+        shorter: likewise; begun after them.
     """
     mosaics: dict[int, Mosaic] = {}
     memory = None if store is None else MosaicMemory(store)
@@ -87,8 +89,12 @@ def write_mosaics(
             except ValueError as error:
                 raise TeamError(f"mosaic of component {component}: {error}") from error
         with watch.stage("writing"):
-            more = [partial(work, component, mosaic) for work in beside]
-            _write_layers(out, name, mosaic, num_workers, more)
+            works = _layers(out, name, mosaic)
+            works[:0] = [partial(work, component, mosaic) for work in longer]
+            works += [partial(work, component, mosaic) for work in shorter]
+            with ThreadPoolExecutor(num_workers) as threads:
+                for done in [threads.submit(work) for work in works]:
+                    done.result()
         mosaics[component] = mosaic
     if memory is not None:
         memory.forget_others()
@@ -178,14 +184,8 @@ def write_overheads(out: Path, fused: Fused, options: OverheadOptions) -> None:
         write_png(out / "overhead" / f"{frame}.png", view)
 
 
-def _write_layers(
-    out: Path,
-    stem: str,
-    mosaic: Mosaic,
-    num_workers: int,
-    more: Sequence[Callable[[], None]] = (),
-) -> None:
-    """Write the layers, several at a time: compressing them takes as long as a few pictures do."""
+def _layers(out: Path, stem: str, mosaic: Mosaic) -> list[Callable[[], None]]:
+    """Return what writes the layers, those that take long first."""
 
     def write(suffix: str, picture: Callable[[], np.ndarray]) -> None:
         write_png(out / f"{stem}{suffix}.png", picture())
@@ -197,11 +197,7 @@ def _write_layers(
         ("_count", lambda: np.asarray(cv2.convertScaleAbs(mosaic.count, alpha=COUNT_GREY))),
         ("_few", lambda: 255 * mosaic.uncertain.astype(np.uint8)),
     )
-    with ThreadPoolExecutor(num_workers) as threads:
-        begun = [threads.submit(work) for work in more]
-        begun += [threads.submit(write, *layer) for layer in layers]
-        for done in begun:
-            done.result()
+    return [partial(write, *layer) for layer in layers]
 
 
 def _see_through(colours: Image, count: np.ndarray) -> Image:
