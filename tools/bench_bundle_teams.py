@@ -9,12 +9,12 @@ import numpy as np
 from groundfuse.backend.bundle_estimate import BundleEstimate
 from groundfuse.backend.drift import accuracy
 from groundfuse.backend.measurement import Attitude, FrameId, Se2, TeamEstimate
-from groundfuse.frontend.ahead import Result
 from groundfuse.frontend.camera import Camera
 from groundfuse.tools.errors import TeamError
 from groundfuse.tools.pipeline import Fused, PipelineOptions, Stopwatch, fuse_robots
 from groundfuse.tools.robot import Robot
 from groundfuse.tools.team_graphs import accepted_edges
+from groundfuse.tools.workers import silent
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,14 +121,10 @@ def _with_camera(robot: Robot, camera: Camera) -> Robot:
     return replace(robot, camera=camera, frames=tuple(frames))
 
 
-def _quiet(items: Iterable[Result], total: int, title: str) -> Iterable[Result]:  # noqa: ARG001
-    return items
-
-
 def fused(robots: Sequence[Robot], num_workers: int) -> tuple[Fused, float]:
     """Run the whole main job; with the seconds of its bundle."""
     watch = Stopwatch()
-    team = fuse_robots(robots, PipelineOptions(), num_workers, _quiet, watch)
+    team = fuse_robots(robots, PipelineOptions(), num_workers, silent, watch)
     return team, watch.seconds["bundle"]
 
 

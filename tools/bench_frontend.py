@@ -11,7 +11,7 @@ import os
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -23,7 +23,6 @@ import cv2
 import numpy as np
 
 from groundfuse.backend.measurement import Attitude, RelativePose, Se2
-from groundfuse.frontend.ahead import Result
 from groundfuse.frontend.camera import Camera, Intrinsics, Mount
 from groundfuse.frontend.repetition import REPEATS
 from groundfuse.tools import render_team
@@ -34,6 +33,7 @@ from groundfuse.tools.pair_verdict import Spot, compare, look
 from groundfuse.tools.pipeline import PipelineOptions, Stopwatch, fuse_robots
 from groundfuse.tools.robot import Frame, Robot
 from groundfuse.tools.team_folder import read_team
+from groundfuse.tools.workers import silent
 from groundfuse.tools.world import RenderedFrame, RenderedTeam, RobotSpec, make_team
 
 RIGHT_M, RIGHT_RAD = 0.030, math.radians(3.0)
@@ -143,10 +143,6 @@ def bench_pairs(floor: str, seeds: Sequence[int], options: FrontEndOptions) -> l
     return lines
 
 
-def _quiet(items: Iterable[Result], total: int, title: str) -> Iterable[Result]:  # noqa: ARG001
-    return items
-
-
 def bench_team(floor: str, seed: int, options: FrontEndOptions, num_workers: int) -> str:
     """Render and fuse 2 x 13 views; return the table's line."""
     with tempfile.TemporaryDirectory() as folder:
@@ -155,7 +151,7 @@ def bench_team(floor: str, seed: int, options: FrontEndOptions, num_workers: int
             raise SystemExit(2)
         robots = read_team(Path(folder), ("A", "B"))
         watch = Stopwatch()
-        fused = fuse_robots(robots, PipelineOptions(front_end=options), num_workers, _quiet, watch)
+        fused = fuse_robots(robots, PipelineOptions(front_end=options), num_workers, silent, watch)
     record = drift_record(fused)
     cells = []
     for name in ("A", "B"):

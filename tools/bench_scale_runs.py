@@ -6,7 +6,7 @@ import resource
 import shutil
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +15,6 @@ import numpy as np
 
 from groundfuse.backend.drift import accuracy
 from groundfuse.backend.measurement import FrameId
-from groundfuse.frontend.ahead import Result
 from groundfuse.frontend.features import FeatureOptions, detect
 from groundfuse.frontend.mosaic import MosaicOptions
 from groundfuse.frontend.retrieval import (
@@ -38,17 +37,12 @@ from groundfuse.tools.render_files import picture_name
 from groundfuse.tools.robot import Frame, Robot
 from groundfuse.tools.robot_folder import IMAGES
 from groundfuse.tools.store import Store
-from groundfuse.tools.workers import Threads
+from groundfuse.tools.workers import Threads, silent
 
 SAME_FLOOR = 0.3
 """Overlap from which a guess counts as right."""
 ASKED = 0.45
 """Frames whose best partner shares less than this are not asked for one."""
-
-
-def quiet(items: Iterable[Result], total: int, title: str) -> Iterable[Result]:  # noqa: ARG001
-    """Show no progress."""
-    return items
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +73,7 @@ def grown(robots: Sequence[Robot], num_workers: int) -> Growth:
     with tempfile.TemporaryDirectory() as temporary:
         out = Path(temporary)
         with Store(out / "store.sqlite") as store:
-            fused = fuse_robots(robots, PipelineOptions(), num_workers, quiet, watch, store=store)
+            fused = fuse_robots(robots, PipelineOptions(), num_workers, silent, watch, store=store)
             options = MosaicOptions()
             write_mosaics(out, fused, options, num_workers, watch, quiet=True, store=store)
     truth = {frame: pose for robot in robots for frame, pose in (robot.truth or {}).items()}
@@ -175,7 +169,7 @@ def matching_s(robots: Sequence[Robot], num_threads: int) -> dict[str, float]:
     """Return seconds of each stage of the front-end."""
     watch = Stopwatch()
     options, workers = FrontEndOptions(), Threads(num_threads)
-    run_front_end(robots, options, workers, Store(), quiet, watch.stage)
+    run_front_end(robots, options, workers, Store(), silent, watch.stage)
     return watch.seconds
 
 

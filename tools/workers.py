@@ -22,6 +22,11 @@ class Progress(Protocol):
         ...
 
 
+def silent(items: Iterable[Result], total: int, title: str) -> Iterable[Result]:  # noqa: ARG001
+    """Show no progress."""
+    return items
+
+
 class Workers(Protocol):
     """Carry out work orders; whoever does it, the bytes are the same."""
 
