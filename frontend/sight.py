@@ -1,5 +1,6 @@
 """Where the cells of a floor grid appear in a picture; the exact half of every mosaic warp."""
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -177,12 +178,17 @@ def _off_whole_cells_m(grid: Grid) -> tuple[float, float]:
     return x_m, y_m
 
 
+@functools.lru_cache(maxsize=1024)
 def cam_from_team(attitude: Attitude, team_from_foot: Se2) -> Matrix:
-    """Return the 3x3 matrix that takes floor points (x, y, 1) of the team to the camera's axes."""
+    """Return the 3x3 matrix that takes floor points (x, y, 1) of the team to the camera's axes.
+
+    Each view takes part in many tiles.
+    """
     rotation = foot_from_cam(attitude.tilt_rad, attitude.roll_rad)
     cam_from_foot = np.column_stack([rotation[:2].T, -attitude.height_m * rotation[2]])
     foot_from_team = team_from_foot.inverse().matrix()
     matrix: Matrix = cam_from_foot @ foot_from_team
+    matrix.flags.writeable = False
     return matrix
 
 
