@@ -10,6 +10,7 @@ kept and used again with `--keep FOLDER`. Run it on an idle machine.
 """
 
 import argparse
+import math
 import os
 import statistics
 import sys
@@ -32,7 +33,7 @@ from groundfuse.tools.front_end_options import Matcher
 STAGES = ("features", "retrieval", "pairs", "graphs", "patches", "bundle", "mosaic")
 WARMING = 2
 """Pictures of each robot that are looked at before time is taken."""
-TURNS = 3
+TURNS = 5
 """Times that one thread and two do the same work."""
 
 
@@ -100,15 +101,21 @@ def bench_speed(floor: str, seed: int) -> None:
 
 
 def bench_gain(size: int, seed: int, folder: Path) -> None:
-    """Print what a second thread is worth, in medians of turns about, with code loaded before."""
+    """Print what a second thread is worth, with code loaded before.
+
+    The machine's speed may change from one run to the next, so it is the median of the turns'
+    ratios, not a ratio of medians.
+    """
     robots = fleet(folder, size, seed)
     matching_s([replace(robot, frames=robot.frames[:WARMING]) for robot in robots], 1)
     turns = [[matching_s(robots, threads) for threads in (1, 2)] for _ in range(TURNS)]
     for stage in ("features", "pairs"):
-        one, two = (statistics.median(turn[k].get(stage, 0.0) for turn in turns) for k in (0, 1))
+        seconds = [[turn[k].get(stage, math.nan) for k in (0, 1)] for turn in turns]
+        one, two = (statistics.median(column) for column in zip(*seconds, strict=True))
+        gains = sorted(alone / both for alone, both in seconds)
         print(
             f"{size} frames, {stage}: {one:.1f} s with 1 thread, {two:.1f} s with 2:"
-            f" {one / two:.2f} times as fast",
+            f" {statistics.median(gains):.2f} times as fast ({gains[0]:.2f} to {gains[-1]:.2f})",
             flush=True,
         )
 
