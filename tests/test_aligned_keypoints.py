@@ -55,12 +55,12 @@ def of_edge(found, number):
     return [part[end] for end in ends for part in (seen.frame, seen.ray, seen.sigma)]
 
 
-def same(found, known, numbers=None):
-    """Whether edges (all, or these of `found`) have the same correspondences, to the bit."""
+def same(found, known, numbers=None, rtol=0.0):
+    """Whether edges (all, or these of `found`) have the same correspondences, or nearly."""
     count = int(max(found.links.edge.max(), known.links.edge.max())) + 1
     numbers = range(count) if numbers is None else numbers
     return all(
-        np.array_equal(one, other)
+        one.shape == other.shape and np.allclose(one, other, rtol=rtol, atol=0.0)
         for place, number in enumerate(numbers)
         for one, other in zip(of_edge(found, number), of_edge(known, place), strict=True)
     )
@@ -130,7 +130,8 @@ def test_little_room_gives_the_same_bits(fused, accepted):
 
 def test_the_order_of_the_pairs_does_not_matter(fused, accepted):
     backwards = range(len(accepted) - 1, -1, -1)
-    assert same(run(fused, accepted[::-1]), run(fused, accepted), backwards)
+    # A keypoint's variance is a mean over its pairs, in their order.
+    assert same(run(fused, accepted[::-1]), run(fused, accepted), backwards, rtol=1e-14)
 
 
 def test_what_is_known_is_not_made_again(fused, accepted, monkeypatch):
