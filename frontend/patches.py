@@ -174,36 +174,20 @@ def patch_plan(
     other = _through_lenses(views, there, known.rays[finest], reach_px)
     times = np.sqrt(known.fineness[finest] / known.fineness[which])
     halvings = np.clip(np.round(np.log2(times) - LATER), 0, MOST_HALVINGS).astype(np.int64)
-    from_px = _affine(lens.ray_by_px, rays)
+    ray_by_px = _inverse(lens.by_ray)
+    from_px = _affine(ray_by_px, rays)
     eye = np.broadcast_to(np.eye(2), lens.by_ray.shape)
     shift = _affine(eye, known.floor[finest] - known.floor[which])
     to_px = _affine(other.by_ray, -_times(other.by_ray, known.rays[finest]))
     floor_from_cam = np.linalg.inv(cam_from_floor)
     carried = to_px @ cam_from_floor[there] @ shift @ floor_from_cam[view] @ from_px
-    return PatchPlan(
-        views,
-        view,
-        rays,
-        lens.place,
-        lens.ray_by_px,
-        there,
-        other.place,
-        carried,
-        _bend(carried, lens, other),
-        halvings,
-    )
-
-
-def _bend(carried: Floats, lens: "_Lens", other: "_Lens") -> Floats:
-    """Return what two lenses add (n, 2, 3) to maps (n, 3, 3) between their pixels, x x, x y, y y.
-
-    The lens behind takes its bend off the pixel first; the one ahead adds its own at the end.
-    """
     # In the middle the map is 0: its derivative is that of the numerator.
     linear = carried[:, :2, :2] / carried[:, 2:, 2:]
-    behind, ahead = lens.bend_of(lens.ray_by_px), other.bend_of(other.ray_by_px @ linear)
-    added: Floats = ahead - linear @ behind
-    return added
+    # The lens behind takes its bend off the pixel first; the one ahead adds its own at the end.
+    bend = other.bend_of(_inverse(other.by_ray) @ linear) - linear @ lens.bend_of(ray_by_px)
+    return PatchPlan(
+        views, view, rays, lens.place, ray_by_px, there, other.place, carried, bend, halvings
+    )
 
 
 def _cam_from_floor(views: Sequence[PatchView]) -> Floats:
@@ -244,11 +228,6 @@ class _Lens(NamedTuple):
     place: Points
     by_ray: Floats
     bend: Floats
-
-    @property
-    def ray_by_px(self) -> Floats:
-        """How rays move with their pixels (n, 2, 2)."""
-        return _inverse(self.by_ray)
 
     def bend_of(self, by: Floats) -> Floats:
         """Return the bend (n, 2, 3) of other steps (x, y), by which the rays move so (n, 2, 2)."""

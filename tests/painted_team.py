@@ -122,8 +122,3 @@ def copied_pair(folder: Path) -> Path:
     """A copy of `PAIR` to spoil."""
     shutil.copytree(painted_pair(), folder)
     return folder
-
-
-def silent(items, _total, _title):
-    """Progress that shows nothing."""
-    return items

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from painted_team import HEIGHT_M, PAIR, QUICK, SIGMA, painted_pair, silent
+from painted_team import HEIGHT_M, PAIR, QUICK, SIGMA, painted_pair
 
 from groundfuse.backend.bundle_tracks import matched
 from groundfuse.backend.measurement import Attitude, FrameId, RelativePose, Se2
@@ -19,6 +19,7 @@ from groundfuse.tools.settings import with_settings
 from groundfuse.tools.store import Store
 from groundfuse.tools.team_folder import read_team
 from groundfuse.tools.team_graphs import accepted_edges
+from groundfuse.tools.workers import silent
 
 OPTIONS = PatchOptions()
 

@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import pytest
 from floor_pairs import camera, drawn, error_of, nees, photo, true_motion
-from painted_team import silent
 from scipy import stats
 
 from groundfuse.backend.measurement import (
@@ -37,7 +36,7 @@ from groundfuse.tools.pair_verdict import Spot, compare, look, odometry_gate, sw
 from groundfuse.tools.robot import Frame, Odometry, Robot
 from groundfuse.tools.similar import similar_pairs
 from groundfuse.tools.store import Store
-from groundfuse.tools.workers import AHEAD, Threads, in_threads
+from groundfuse.tools.workers import AHEAD, Threads, in_threads, silent
 
 BARREL = (-0.2, 0.05, 1e-3, -8e-4, 0.0)
 CAMERAS = {

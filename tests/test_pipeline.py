@@ -18,7 +18,7 @@ from fused_world import (
     robots_of,
     world,
 )
-from painted_team import PAIR, QUICK, SIGMA, painted_pair, silent
+from painted_team import PAIR, QUICK, SIGMA, painted_pair
 
 from groundfuse.backend.bundle_estimate import BundleEstimate, BundleRefusal, Illposed
 from groundfuse.backend.drift import accuracy
@@ -29,6 +29,7 @@ from groundfuse.tools.pipeline import Stopwatch, fuse_robots
 from groundfuse.tools.settings import with_settings
 from groundfuse.tools.team_folder import read_team
 from groundfuse.tools.team_graphs import accepted_edges, odometry_edges
+from groundfuse.tools.workers import silent
 
 # a^-1 b of two poses of size 3 and back: a few eps; worst seen 4e-16.
 EXACT = 1e-12

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from painted_team import QUICK, painted_pair, silent
+from painted_team import QUICK, painted_pair
 
 from groundfuse.backend.bundle_estimate import Estimated, MountEstimate
 from groundfuse.backend.drift import accuracy
@@ -19,6 +19,7 @@ from groundfuse.tools.second_look import as_filed, corrected, is_worth_it
 from groundfuse.tools.settings import with_settings
 from groundfuse.tools.team_folder import read_team
 from groundfuse.tools.team_graphs import accepted_edges
+from groundfuse.tools.workers import silent
 
 LENS = Intrinsics(
     640, 480, 548.0, 549.5, 316.8, 243.0, Distortion.EQUIDISTANT, (0.012, -0.004, 0.001, 0.0)

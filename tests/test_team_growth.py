@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import pytest
-from painted_team import QUICK, painted_pair, silent
+from painted_team import QUICK, painted_pair
 
 from groundfuse.backend.bundle_estimate import BundleEstimate
 from groundfuse.tools import team_graphs
@@ -12,6 +12,7 @@ from groundfuse.tools.pipeline import Stopwatch, fuse_robots
 from groundfuse.tools.settings import with_settings
 from groundfuse.tools.store import Store
 from groundfuse.tools.team_folder import read_team
+from groundfuse.tools.workers import silent
 
 # Either answer may lie a fifth of a sigma from the optimum, see `bundle.SETTLED`.
 TOLERANCE_SIGMA = 0.5
