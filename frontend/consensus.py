@@ -19,6 +19,7 @@ from groundfuse.frontend.arrays import Floats, Mask, Points
 from groundfuse.frontend.consensus_draws import allowed, distinct, draw
 from groundfuse.frontend.consensus_table import Limits, Table
 from groundfuse.frontend.consensus_votes import climb, count_votes
+from groundfuse.frontend.middle import middle
 
 
 class Candidates(NamedTuple):
@@ -165,8 +166,7 @@ def _limits(
     gate: Gate | None,
 ) -> Limits:
     """Return what is asked of a motion; a gate gives way by the tolerance that wobble needs."""
-    middle = len(found.floor_b) // 2
-    centre = np.partition(found.floor_b.T.copy(), middle)[:, middle]
+    centre = middle(found.floor_b.T.copy())
     expected, gate_m, gate_rad = np.array([1.0, 0.0, 0.0, 0.0]), np.inf, np.inf
     if gate is not None:
         size_m = float(np.sqrt(((found.floor_b - centre) ** 2).sum(axis=1).mean()))

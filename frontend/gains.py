@@ -18,6 +18,7 @@ from scipy.sparse.linalg import splu
 from groundfuse.frontend.arrays import Floats
 from groundfuse.frontend.camera import Intrinsics
 from groundfuse.frontend.gains_compiled import POWERS, add_normal, distances
+from groundfuse.frontend.middle import middle
 
 Numbers = NDArray[np.intp]
 """(n,) which cell, view or lens."""
@@ -145,15 +146,9 @@ def _robust_fit(floor: _Floor, num_views: int, num_lenses: int) -> tuple[Floats,
         if np.abs(gain - before).max() < STILL:
             break
         distances(floor.seen, floor.begins, weight, gain, falloff, distance)
-        scale = max(MAD_TO_SIGMA * _middle(distance), SMALLEST_SCALE)
+        scale = max(MAD_TO_SIGMA * float(middle(distance)), SMALLEST_SCALE)
         weight = 1.0 / (1.0 + (distance / scale) ** 2)
     return gain, falloff
-
-
-def _middle(values: Floats) -> float:
-    """Return the median of many values, of two the higher: one place is found far quicker."""
-    place = len(values) // 2
-    return float(np.partition(values, place)[place])
 
 
 def _solve(floor: _Floor, weight: Floats, num_views: int, num_lenses: int) -> tuple[Floats, Floats]:
@@ -190,5 +185,5 @@ def _noise(floor: _Floor, point: Floats, gain: Floats, falloff: Floats) -> float
     difference = np.abs(np.diff(even, axis=0))
     across = floor.begins[1:-1] - 1  # from the last view of a cell to the first of the next
     difference = np.delete(difference, across, axis=0)
-    sigma = MAD_TO_SIGMA * _middle(difference.ravel()) / np.sqrt(2.0)
+    sigma = MAD_TO_SIGMA * float(middle(difference.ravel())) / np.sqrt(2.0)
     return max(float(sigma), SMALLEST_NOISE_LEVELS)

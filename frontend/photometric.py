@@ -20,6 +20,7 @@ from groundfuse.frontend.arrays import Floats, Image, Mask, Points
 from groundfuse.frontend.camera import Camera, Intrinsics
 from groundfuse.frontend.fit import Prior
 from groundfuse.frontend.fit_compiled import transfer_rows
+from groundfuse.frontend.middle import middle
 from groundfuse.frontend.normalise import local_contrast
 from groundfuse.frontend.normalise_compiled import halves
 from groundfuse.frontend.photometric_compiled import Lens, Slopes, linearise, weigh
@@ -147,9 +148,7 @@ def align(
         lens = _lens(b.camera.intrinsics, _rows(points.rays, pose, attitude)[:, :, 11])
         for _ in range(options.iterations):
             error, jacobian = _linearised(points, pictured, lens, pose, attitude, light)
-            middle = len(error) // 2
-            deviation = MAD_TO_SIGMA * float(np.partition(np.abs(error), middle)[middle])
-            residual = max(FAINTEST, deviation)
+            residual = max(FAINTEST, MAD_TO_SIGMA * float(middle(np.abs(error))))
             hessian, gradient = _prior_part(sigma) + 1e-9 * np.eye(11), np.zeros(11)
             gradient[3:9] = (attitude - mean) / sigma**2
             weigh(error, jacobian, residual, options.cauchy_sigmas, (hessian, gradient))
