@@ -204,15 +204,6 @@ def test_a_picture_that_vanished_meanwhile_is_named(tmp_path):
         written(tmp_path / "out", fused)
 
 
-def test_a_png_comes_back_to_the_bit_or_is_refused(tmp_path):
-    picture = np.random.default_rng(1).integers(0, 256, (5, 7, 3), dtype=np.uint8)
-    pictures.write_png(tmp_path / "new" / "x.png", picture)
-    assert np.array_equal(decoded(tmp_path / "new" / "x.png"), picture)
-    (tmp_path / "file").write_text("x")
-    with pytest.raises(DataError, match="a file stands where a folder is needed"):
-        pictures.write_png(tmp_path / "file" / "x.png", picture)
-
-
 def test_every_frame_has_an_overhead_view_of_its_own(tmp_path):
     fused, options = fused_at_truth(), OverheadOptions(cell_per_height=0.01)
     pictures.write_overheads(tmp_path, fused, options)

@@ -32,6 +32,7 @@ from groundfuse.tools.geotiff import BLOCK, can_write, new_geotiff
 from groundfuse.tools.mosaic_memory import MosaicMemory
 from groundfuse.tools.outputs import component_name
 from groundfuse.tools.pipeline import Fused, Stopwatch
+from groundfuse.tools.png_file import write_png
 from groundfuse.tools.store import Store
 from groundfuse.tools.team_folder import load_image
 
@@ -213,11 +214,3 @@ def world_file(mosaic: Mosaic) -> str:
     y_m = mosaic.y_max_m - mosaic.m_per_px / 2.0
     numbers = (mosaic.m_per_px, 0.0, 0.0, -mosaic.m_per_px, x_m, y_m)
     return "".join(f"{number!r}\n" for number in numbers)
-
-
-def write_png(path: Path, picture: np.ndarray) -> None:
-    """Write a picture of 8 bits."""
-    encoded, data = cv2.imencode(".png", picture)
-    if not encoded:
-        raise TeamError(f"{path}: the picture could not be encoded")
-    write_atomic(path, data.tobytes())
