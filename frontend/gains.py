@@ -15,13 +15,22 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
+from groundfuse.backend.side_by_side import side_by_side
 from groundfuse.frontend.arrays import Floats
 from groundfuse.frontend.camera import Intrinsics
-from groundfuse.frontend.gains_compiled import POWERS, add_normal, distances
+from groundfuse.frontend.gains_compiled import (
+    CHANNELS,
+    POWERS,
+    cell_sums,
+    distances,
+    view_rows,
+)
 from groundfuse.frontend.middle import middle
 
 Numbers = NDArray[np.intp]
 """(n,) which cell, view or lens."""
+Short = NDArray[np.uint32]
+"""The same, in compiled loops."""
 
 ITERATIONS = 12
 STILL = 1e-4
@@ -36,6 +45,8 @@ FALLOFF_PRIOR = 0.01
 """Weight of "no falloff" in samples: decides only what overlaps leave open."""
 SMALLEST_NOISE_LEVELS = 1.0
 USUAL_NOISE_LEVELS = 3.0
+PARTS = 8
+"""Of the cells that add up on their own: so sums don't depend on the number of threads."""
 MAD_TO_SIGMA = 1.4826
 
 
@@ -98,17 +109,14 @@ def estimate_exposure(samples: Samples, lens_of_view: Numbers) -> Exposure:
         samples: of all pictures; cells that only one picture sees tell nothing and may be there.
         lens_of_view: (views,) number of each picture's lens.
     """
-    num_views, num_lenses = len(lens_of_view), int(lens_of_view.max()) + 1
     _, cell, seen = np.unique(samples.cell, return_inverse=True, return_counts=True)
     shared = seen[cell] > 1
     if not shared.any():
-        return neutral_exposure(num_views)
-    by_cell_and_view = cell[shared] * num_views + samples.view[shared]
+        return neutral_exposure(len(lens_of_view))
+    by_cell_and_view = cell[shared] * len(lens_of_view) + samples.view[shared]
     order = np.flatnonzero(shared)[np.argsort(by_cell_and_view, kind="stable")]
-    view, begins = samples.view[order], np.append(0, np.cumsum(seen[seen > 1]))
-    values = np.log(np.maximum(samples.colour[order], 1.0))
-    floor = _Floor(view, lens_of_view[view], samples.radius2[order], values, begins)
-    gain, falloff = _robust_fit(floor, num_views, num_lenses)
+    floor = _floor(samples, order, seen[seen > 1], lens_of_view)
+    gain, falloff = _robust_fit(floor)
     noise_levels = _noise(floor, samples.point[order], gain, falloff)
     return Exposure(gain, falloff[lens_of_view], noise_levels)
 
@@ -117,73 +125,154 @@ class _Floor(NamedTuple):
     """Samples in order of their cells, and of the views in a cell.
 
     Attributes:
-        view: (n,) number of the picture.
-        lens: (n,) number of its lens.
-        radius2: (n,) see `Samples`.
-        values: (n, 3) logarithms of the colours.
-        begins: (cells + 1,) first sample of each cell, and the number of samples.
+        seen: views (n,), their lenses (n,), radius2 (n,) as in `Samples`, and logarithms of the
+            colours (n, 3).
+        places: see `view_rows`.
+        pattern: see `view_rows`.
+        lens_of_view: (views,).
     """
 
-    view: Numbers
-    lens: Numbers
-    radius2: Floats
-    values: Floats
-    begins: Numbers
-
-    @property
-    def seen(self) -> tuple[Numbers, Numbers, Floats, Floats]:
-        """As the compiled loops take them."""
-        return self.view, self.lens, self.radius2, self.values
+    seen: tuple[Short, Short, Floats, Floats]
+    places: tuple[Short, Short, Short, Short]
+    pattern: tuple[Short, Short]
+    lens_of_view: Numbers
 
 
-def _robust_fit(floor: _Floor, num_views: int, num_lenses: int) -> tuple[Floats, Floats]:
+def _floor(samples: Samples, order: Numbers, number: Numbers, lens_of_view: Numbers) -> _Floor:
+    """Return samples in their `order`, so many of each cell."""
+    view, num_views = samples.view[order], len(lens_of_view)
+    values = np.log(np.maximum(samples.colour[order], 1.0))
+    begins, cell = _ends(number), np.repeat(np.arange(len(number)), number)
+    by_view, first = np.argsort(view, kind="stable"), _ends(np.bincount(view, minlength=num_views))
+    seen = sparse.csr_array((np.ones(len(view), np.bool_), view, begins), (len(number), num_views))
+    together = (seen.T @ seen).tocsr()
+    together.sort_indices()
+    return _Floor(
+        (_short(view), _short(lens_of_view[view]), samples.radius2[order], values),
+        (_short(begins), _short(cell), _short(by_view), _short(first)),
+        (_short(together.indptr), _short(together.indices)),
+        lens_of_view,
+    )
+
+
+def _ends(number: Numbers) -> Numbers:
+    """Return the first of each group of so many, and the number of all."""
+    return np.append(0, np.cumsum(number))
+
+
+def _short(numbers: Numbers) -> Short:
+    """Return places that compiled loops need not check for counting from the end."""
+    return numbers.astype(np.uint32)
+
+
+def _robust_fit(floor: _Floor) -> tuple[Floats, Floats]:
     """Least squares, reweighted: log gains (views, 3), the falloffs' coefficients (lenses, 3)."""
-    weight, distance = np.ones(len(floor.view)), np.empty(len(floor.view))
-    gain, falloff = np.zeros((num_views, 3)), np.zeros((num_lenses, POWERS))
+    weight, distance = np.ones(len(floor.seen[0])), np.empty(len(floor.seen[0]))
+    gain = np.zeros((len(floor.lens_of_view), CHANNELS))
+    falloff = np.zeros((int(floor.lens_of_view.max()) + 1, POWERS))
     for _ in range(ITERATIONS):
         before = gain
-        gain, falloff = _solve(floor, weight, num_views, num_lenses)
+        gain, falloff = _solve(floor, weight)
         if np.abs(gain - before).max() < STILL:
             break
-        distances(floor.seen, floor.begins, weight, gain, falloff, distance)
+
+        _fill_distances(floor, weight, (gain, falloff), distance)
         scale = max(MAD_TO_SIGMA * float(middle(distance)), SMALLEST_SCALE)
         weight = 1.0 / (1.0 + (distance / scale) ** 2)
     return gain, falloff
 
 
-def _solve(floor: _Floor, weight: Floats, num_views: int, num_lenses: int) -> tuple[Floats, Floats]:
+def _fill_distances(
+    floor: _Floor, weight: Floats, found: tuple[Floats, Floats], distance: Floats
+) -> None:
+    """Fill how far samples lie off their cells' means, with these gains and falloffs."""
+    begins = floor.places[0]
+
+    def fill(cells: slice) -> None:
+        distances(floor.seen, begins[cells.start : cells.stop + 1], weight, *found, distance)
+
+    side_by_side(fill, len(begins) - 1)
+
+
+def _solve(floor: _Floor, weight: Floats) -> tuple[Floats, Floats]:
     """Weighted least squares with each cell's own colour eliminated.
 
     The falloff is the same in all channels, so it follows from their mean, and then each channel's
     gains follow on their own. Few pairs of views share floor: the gains' block is sparse.
     """
-    size = num_views + POWERS * num_lenses
-    upper, right = np.zeros((size, size)), np.zeros((size, 3))
-    add_normal(floor.seen, floor.begins, weight, num_views, (upper, right))
-    normal = upper + np.triu(upper, 1).T
-    samples = np.bincount(floor.view, weight, num_views)
-    prior = np.full(size, FALLOFF_PRIOR)
-    prior[:num_views] = GAIN_PRIOR * np.maximum(samples, 1.0)
-    normal += np.diag(prior)
-    gains, both = slice(0, num_views), normal[:num_views, num_views:]
-    block = sparse.csc_array(normal[gains, gains])  # positive definite: it needs no pivots
-    symmetric = {"SymmetricMode": True}
+    normal = _normal_equations(floor, weight)
+    samples = np.bincount(floor.seen[0], weight, len(floor.lens_of_view))
+    prior = sparse.diags_array(GAIN_PRIOR * np.maximum(samples, 1.0))
+    symmetric = {"SymmetricMode": True}  # positive definite: it needs no pivots
+    block = sparse.csc_array(normal.of_gain + prior)
     solved = splu(block, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric).solve
     # Block elimination: the falloff of the mean channel first.
-    of_falloff = normal[num_views:, num_views:] - both.T @ solved(both)
-    mean = right.mean(axis=1)
-    falloff = np.linalg.solve(of_falloff, mean[num_views:] - both.T @ solved(mean[gains]))
-    gain: Floats = solved(right[gains] - (both @ falloff)[:, None])
-    return gain, falloff.reshape(num_lenses, POWERS)
+    both, of_falloff = normal.both, normal.of_falloff - normal.both.T @ solved(normal.both)
+    of_falloff += FALLOFF_PRIOR * np.eye(len(of_falloff))
+    mean, falloff_mean = normal.right.mean(axis=1), normal.right_of_falloff.mean(axis=1)
+    falloff = np.linalg.solve(of_falloff, falloff_mean - both.T @ solved(mean))
+    gain: Floats = solved(normal.right - (both @ falloff)[:, None])
+    return gain, falloff.reshape(-1, POWERS)
+
+
+class _Normal(NamedTuple):
+    """Normal equations in blocks.
+
+    Attributes:
+        of_gain: (views, views), sparse.
+        both: (views, columns) between gains and falloffs.
+        right: (views, 3).
+        of_falloff: (columns, columns).
+        right_of_falloff: (columns, 3).
+    """
+
+    of_gain: sparse.csr_array
+    both: Floats
+    right: Floats
+    of_falloff: Floats
+    right_of_falloff: Floats
+
+
+def _normal_equations(floor: _Floor, weight: Floats) -> _Normal:
+    """Return them, each cell's own colour eliminated."""
+    begins, num_views = floor.places[0], len(floor.lens_of_view)
+    num_cells, columns = len(begins) - 1, POWERS * (int(floor.lens_of_view.max()) + 1)
+    whole, mean = np.empty(num_cells), np.empty((num_cells, CHANNELS))
+    of_falloff, right_of_falloff = (np.zeros((PARTS, columns, n)) for n in (columns, CHANNELS))
+    ends = [num_cells * k // PARTS for k in range(PARTS + 1)]
+
+    def add(parts: slice) -> None:
+        for k in range(parts.start, parts.stop):
+            some = slice(ends[k], ends[k + 1])
+            rows, cells = (of_falloff[k], right_of_falloff[k]), (whole[some], mean[some])
+            cell_sums(floor.seen, begins[some.start : some.stop + 1], weight, cells, rows)
+
+    between, both = np.empty(len(floor.pattern[1])), np.zeros((num_views, columns))
+    right = np.zeros((num_views, CHANNELS))
+
+    def fill(views: slice) -> None:
+        weighted, rows = (weight, whole, mean), (between, both, right)
+        view_rows(
+            floor.seen, floor.places, weighted, floor.pattern, rows, (views.start, views.stop)
+        )
+
+    side_by_side(add, PARTS, least_items=PARTS)
+    side_by_side(fill, num_views)
+    starts, others = floor.pattern
+    of_gain = sparse.csr_array((between, others, starts), shape=(num_views, num_views))
+    return _Normal(of_gain, both, right, of_falloff.sum(axis=0), right_of_falloff.sum(axis=0))
 
 
 def _noise(floor: _Floor, point: Floats, gain: Floats, falloff: Floats) -> float:
     """Standard deviation of one view of a cell: from differences between two views of it."""
-    c1, c2, c3 = falloff.T[:, floor.lens]
-    fall = floor.radius2 * (c1 + floor.radius2 * (c2 + floor.radius2 * c3))
-    even = point * np.exp(-fall)[:, None] * np.exp(-gain)[floor.view]
+    view, lens, radius2, _ = floor.seen
+    c1, c2, c3 = falloff.T[:, lens]
+    fall = radius2 * (c1 + radius2 * (c2 + radius2 * c3))
+    even = point * np.exp(-fall)[:, None] * np.exp(-gain)[view]
     difference = np.abs(np.diff(even, axis=0))
-    across = floor.begins[1:-1] - 1  # from the last view of a cell to the first of the next
+    across = (
+        floor.places[0][1:-1].astype(np.intp) - 1
+    )  # from the last view of a cell to the first of the next
     difference = np.delete(difference, across, axis=0)
     sigma = MAD_TO_SIGMA * float(middle(difference.ravel())) / np.sqrt(2.0)
     return max(float(sigma), SMALLEST_NOISE_LEVELS)

@@ -12,6 +12,7 @@ BORDER = {
     "groundfuse.backend.measurement",
     "groundfuse.backend.option_checks",
     "groundfuse.backend.reprojection",
+    "groundfuse.backend.side_by_side",
 }
 FOREIGN = {
     "frontend": {"gtsam", "gtsam_unstable", "open3d", "tqdm", "joblib", "yaml"},

@@ -1,5 +1,7 @@
 """Exposure and vignetting are found from shared floor, whatever stands on it."""
 
+import os
+
 import numpy as np
 from analytic_floor import centres, make_camera, ring, rounded, view_of, waves
 
@@ -53,17 +55,17 @@ def test_gains_and_falloffs_are_found_among_obstacles():
 
 
 def test_the_solution_is_that_of_least_squares_with_every_cells_colour():
-    """The third lens shares no floor; nothing is eliminated, and there are two priors."""
+    """The last view and its lens share no floor; nothing is eliminated, there are two priors."""
     rng = np.random.default_rng(8)
     samples = made_samples(rng, rng.normal(0, 0.2, (VIEWS, 3)), rng.normal(0, 0.2, (2, 3)))
     order = np.argsort(samples.cell, kind="stable")[:400]
+    order = order[samples.view[order] < VIEWS - 1]
+    lens_of_view = np.append(np.arange(VIEWS - 1) % 2, 2)
     view, lens = samples.view[order], samples.view[order] % 2
     _, cell, number = np.unique(samples.cell[order], return_inverse=True, return_counts=True)
     values, radius2 = np.log(samples.colour[order]), samples.radius2[order]
     weight = rng.uniform(0.1, 1.0, len(view))
-    begins = np.append(0, np.cumsum(number))
-    floor = gains._Floor(view, lens, radius2, values, begins)
-    gain, falloff = gains._solve(floor, weight, VIEWS, 3)
+    gain, falloff = gains._solve(gains._floor(samples, order, number, lens_of_view), weight)
 
     size = VIEWS + 9 + len(number)
     design = np.zeros((len(view), size))
@@ -99,6 +101,19 @@ def test_the_order_of_the_samples_does_not_matter():
     np.testing.assert_array_equal(found.log_gain, expected.log_gain)
     np.testing.assert_array_equal(found.falloff, expected.falloff)
     assert found.noise_levels == expected.noise_levels
+
+
+def test_the_number_of_cores_does_not_matter(monkeypatch):
+    rng, views = np.random.default_rng(11), 300
+    cell, view = np.nonzero(rng.random((CELLS, views)) < 0.02)
+    colour = rng.uniform(30.0, 200.0, (len(cell), 3))
+    samples = Samples(cell, view, rng.random(len(cell)), colour, colour)
+    lens_of_view, found = np.arange(views) // 100, []
+    for cores in (1, 3):
+        monkeypatch.setattr(os, "cpu_count", lambda cores=cores: cores)
+        found.append(estimate_exposure(samples, lens_of_view))
+    np.testing.assert_array_equal(found[0].log_gain, found[1].log_gain)
+    np.testing.assert_array_equal(found[0].falloff, found[1].falloff)
 
 
 def test_distances_are_from_the_weighted_mean_of_a_cell():
