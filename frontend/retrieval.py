@@ -11,6 +11,7 @@ fro sees its own floor in more frames than any list holds, and those look more a
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -21,12 +22,14 @@ from groundfuse.frontend.features import Features
 from groundfuse.frontend.retrieval_votes import (
     Cast,
     Indices,
+    Kin,
     Short,
     Votes,
     candidates,
     cast,
     counted,
     most_similar,
+    nearest_kin,
 )
 
 ROUNDS = 10
@@ -98,6 +101,15 @@ class Described:
     glance: Short
 
 
+Lists = tuple[Indices, ...]
+"""Candidates of one frame: of all others, and of other robots where there are such."""
+Casts = tuple[Cast, ...]
+"""Its votes for those of each list."""
+Compare = Callable[[int, Indices], Kin]
+"""Compares a frame's features with some others'; see `nearest_kin`."""
+Count = Callable[[Kin], Cast]
+
+
 class Frames(Protocol):
     """Features of frames by their places, each fetched when it is asked for."""
 
@@ -121,8 +133,8 @@ class Memory(Protocol):
         """Return what is kept of every frame, which the vocabulary says too."""
         ...
 
-    def cast(self, near: Sequence[Indices], work: Callable[[int], Cast]) -> list[Cast]:
-        """Return every frame's votes for its candidates `near`, which depend on their looks."""
+    def cast(self, near: Sequence[Lists], kin: Compare, count: Count) -> Sequence[Casts]:
+        """Return every frame's votes for its lists of candidates; see `cast_for`."""
         ...
 
 
@@ -140,9 +152,9 @@ class Forgetful:
         """Describe every frame."""
         return map(work, range(self.count))
 
-    def cast(self, near: Sequence[Indices], work: Callable[[int], Cast]) -> list[Cast]:
+    def cast(self, near: Sequence[Lists], kin: Compare, count: Count) -> list[Casts]:
         """Let every frame vote."""
-        return list(map(work, range(len(near))))
+        return [cast_for(lists, partial(kin, k), count) for k, lists in enumerate(near)]
 
 
 def learned(sample: Iterable[Features], options: RetrievalOptions) -> Vocabulary | None:
@@ -170,23 +182,42 @@ def votes(
     options: RetrievalOptions,
     robots: Indices | None = None,
     memory: Memory | None = None,
-) -> Votes:
-    """Let every frame's features vote: for all others, or for those of other `robots` (n,).
+) -> list[Votes]:
+    """Let every frame's features vote: for all others, and for those of other robots.
 
     Args:
         short: (n, num_features, c) rows of all frames.
         glances: (n, k c) of all frames.
         options: see `RetrievalOptions`.
-        robots: which robot each frame is of.
+        robots: which robot each frame is of; None for one, and then there are no other votes.
         memory: of votes that were cast before.
     """
-    near = candidates(glances, options.num_candidates, robots)
+    asked = [None] if robots is None else [None, robots]
+    lists = [candidates(glances, options.num_candidates, whose) for whose in asked]
 
-    def work(voter: int) -> Cast:
-        return cast(short[voter], short[near[voter]], options.num_votes)
+    def kin(voter: int, others: Indices) -> Kin:
+        return nearest_kin(short[voter], short[others])
 
-    found = (memory or Forgetful(len(near))).cast(near, work)
-    return counted(near, found, options.num_candidates)
+    def count(nearest: Kin) -> Cast:
+        return cast(nearest, options.num_votes)
+
+    found = (memory or Forgetful(len(short))).cast(list(zip(*lists, strict=True)), kin, count)
+    return [
+        counted(near, [casts[k] for casts in found], options.num_candidates)
+        for k, near in enumerate(lists)
+    ]
+
+
+def cast_for(lists: Lists, kin: Callable[[Indices], Kin], count: Count) -> Casts:
+    """Return one frame's votes for each list of candidates; each is compared once."""
+    every = every_candidate(lists)
+    nearest = kin(every)
+    return tuple(count(nearest[np.searchsorted(every, near)]) for near in lists)
+
+
+def every_candidate(lists: Lists) -> Indices:
+    """Return the frames on any list, each once, in order."""
+    return np.unique(np.concatenate(lists))
 
 
 def stacked(frames: Iterable[Described]) -> tuple[Short, Short]:
@@ -262,8 +293,9 @@ def retrieved(
     short, glances = stacked(
         memory.described(lambda place: described(frames[place], known, options))
     )
-    found = most_similar(votes(short, glances, options, None, memory), options.num_frames)
-    if robots is not None and len(np.unique(robots)) > 1:
-        others = votes(short, glances, options, robots, memory)
-        found |= most_similar(others, options.num_others, options.least_votes)
+    several = robots if robots is not None and len(np.unique(robots)) > 1 else None
+    every, *others = votes(short, glances, options, several, memory)
+    found = most_similar(every, options.num_frames)
+    for some in others:
+        found |= most_similar(some, options.num_others, options.least_votes)
     return sorted(found)

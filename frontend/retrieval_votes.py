@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 Short = NDArray[np.float32]
 Indices = NDArray[np.int64]
 Cast = NDArray[np.float64]
+Kin = NDArray[np.float16]
+"""(k, m) how like the nearest kin of each of a frame's features is in k others. A half's 11 bits
+are finer than what descriptors of two pictures have in common, and much of this is kept."""
 CHUNK = 256
 """Frames whose likeness to all others is held at a time."""
 TOGETHER = 8
@@ -55,21 +58,30 @@ def candidates(glances: Short, most: int, robots: Indices | None = None) -> list
     return found
 
 
-def cast(voter: Short, others: Short, num_votes: int) -> Cast:
-    """Return the votes (k,) of one frame's features (m, c) for its candidates' (k, m, c).
+def nearest_kin(voter: Short, others: Short) -> Kin:
+    """Return how like a frame's features (m, c) their nearest kin in others (k, m, c) are.
 
-    A feature finds its nearest kin in each candidate and votes for the `num_votes` nearest, by how
-    much nearer they are than the next: what looks like everything tells nothing.
+    Each of the others is compared on its own, so its row is the same whoever stands beside it.
     """
-    count, size, width = others.shape
-    nearest = np.empty((count, size), np.float32)
+    count, size, _ = others.shape
+    nearest = np.empty((count, size), np.float16)
     likeness = np.empty((min(TOGETHER, count), size, size), np.float32)
     for start in range(0, count, TOGETHER):
         some = others[start : start + TOGETHER]
         part = likeness[: len(some)]
-        np.matmul(some.reshape(-1, width), voter.T, out=part.reshape(-1, size))
-        part.max(axis=1, out=nearest[start : start + TOGETHER])
-    value = np.maximum(np.ascontiguousarray(nearest.T), 0.0) ** 2
+        np.matmul(some, voter.T, out=part)
+        nearest[start : start + TOGETHER] = part.max(axis=1)
+    return nearest
+
+
+def cast(nearest: Kin, num_votes: int) -> Cast:
+    """Return the votes (k,) of one frame's features for its k candidates.
+
+    A feature votes for the `num_votes` that hold its nearest kin (k, m), by how much nearer that is
+    than the next: what looks like everything tells nothing.
+    """
+    count = len(nearest)
+    value = np.maximum(np.ascontiguousarray(nearest.T, np.float32), 0.0) ** 2
     if count > num_votes:
         next_best = np.partition(value, count - 1 - num_votes, axis=1)[:, count - 1 - num_votes]
         value = np.maximum(value - next_best[:, None], 0.0)

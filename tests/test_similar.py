@@ -53,26 +53,28 @@ def store():
 
 
 @pytest.fixture
-def votes(monkeypatch):
-    """How many frames voted: the length of a list that grows."""
-    cast, voted = retrieval.cast, []
+def compared(monkeypatch):
+    """With how many others frames were compared: a list that grows."""
+    nearest_kin, numbers = retrieval.nearest_kin, []
 
-    def noted(voter, others, num_votes):
-        voted.append(len(others))
-        return cast(voter, others, num_votes)
+    def noted(voter, others):
+        numbers.append(len(others))
+        return nearest_kin(voter, others)
 
-    monkeypatch.setattr(retrieval, "cast", noted)
-    return voted
+    monkeypatch.setattr(retrieval, "nearest_kin", noted)
+    return numbers
 
 
 def run(store, order, road=ROAD, options=OPTIONS, num_threads=2):
     """The pairs and how many looks were fetched; `road` has the features of the order's frames."""
     looks = {frame: key_of("look", k) for frame, k in order.items()}
     seen = Seen((frame, road[k]) for frame, k in order.items())
-    found = similar_pairs(looks, seen, options, store, num_threads)
-    num_read = len(seen.asked)
-    assert found == retrieved_pairs(seen, options)
-    return found, num_read
+    return similar_pairs(looks, seen, options, store, num_threads), len(seen.asked)
+
+
+def by_heart(order, road=ROAD, options=OPTIONS):
+    """The pairs without a store."""
+    return retrieved_pairs({frame: road[k] for frame, k in order.items()}, options)
 
 
 def numbered(names, new=None):
@@ -81,27 +83,48 @@ def numbered(names, new=None):
     return {frame: COUNT if frame == new else next(old) for frame in names}
 
 
-def test_a_first_run_reads_all_and_a_second_nothing(votes, store):
+def test_a_first_run_reads_all_and_a_second_nothing(compared, store):
     found, num_read = run(store, numbered(NAMES))
+    assert found == by_heart(numbered(NAMES))
     assert len(found) >= COUNT
     assert num_read == COUNT + OPTIONS.num_sample
-    assert len(votes) == 4 * COUNT  # two ways each, and once more by heart
+    compared.clear()
     again, num_read = run(store, numbered(NAMES))
     assert (again, num_read) == (found, 0)
-    assert len(votes) == 6 * COUNT
+    assert compared == []
 
 
 @pytest.mark.parametrize("new", [FrameId("B", 30), FrameId("A", 31), FrameId("0", 0)])
-def test_one_frame_more_costs_itself_and_the_votes_of_those_it_resembles(votes, store, new):
-    names = names_with(new)
-    assert new not in sample_of(names, OPTIONS)
+def test_one_frame_more_costs_itself_and_a_comparison_with_those_it_resembles(compared, store, new):
+    order = numbered(names_with(new), new)
+    assert new not in sample_of(order, OPTIONS)
     run(store, numbered(NAMES))
-    votes.clear()
-    _, num_read = run(store, numbered(names, new))
+    compared.clear()
+    found, num_read = run(store, order)
     assert num_read == 1
-    by_heart = 2 * len(names)
-    # Itself both ways, and frames that saw the same marks: worst seen 29 of 122.
-    assert 2 <= len(votes) - by_heart <= 40
+    # Itself with all of its candidates; others with it and nobody else.
+    most = max(compared)
+    assert OPTIONS.num_candidates <= most <= 2 * OPTIONS.num_candidates
+    compared.remove(most)
+    assert set(compared) == {1}
+    assert len(compared) <= 30  # worst seen 15 of 60 frames
+    assert found == by_heart(order)
+
+
+def test_who_votes_anew_and_who_is_compared_follows_from_the_lists(compared, store):
+    """A frame that goes lets another onto the lists: compared once, though the frame came back."""
+    order = numbered(NAMES)
+    gone = next(frame for frame in NAMES if frame not in sample_of(NAMES, OPTIONS))
+    left = {frame: k for frame, k in order.items() if frame != gone}
+    run(store, order)
+    compared.clear()
+    found, _ = run(store, left)
+    assert set(compared) <= {1, 2}  # a place on one list, or on both
+    assert len(compared) >= 2
+    assert found == by_heart(left)
+    compared.clear()
+    run(store, order)
+    assert compared == []  # the votes of the first run are there still
 
 
 def test_a_frame_that_is_gone_costs_no_reading(store):
@@ -109,37 +132,43 @@ def test_a_frame_that_is_gone_costs_no_reading(store):
     gone = next(frame for frame in NAMES if frame not in sample_of(NAMES, OPTIONS))
     left = {frame: k for frame, k in numbered(NAMES).items() if frame != gone}
     assert sample_of(left, OPTIONS) == sample_of(NAMES, OPTIONS)
-    assert run(store, left)[1] == 0
+    found, num_read = run(store, left)
+    assert (found, num_read) == (by_heart(left), 0)
 
 
-def test_another_sample_teaches_all_anew(votes, store):
+def test_another_sample_teaches_all_anew(compared, store):
     """The right pairs though what was kept was taught by another sample."""
     run(store, numbered(NAMES))
     new = next(
         f for k in range(30, 999) if (f := FrameId("B", k)) in sample_of([*NAMES, f], OPTIONS)
     )
-    votes.clear()
-    _, num_read = run(store, numbered(names_with(new), new))
+    compared.clear()
+    order = numbered(names_with(new), new)
+    found, num_read = run(store, order)
     assert num_read == COUNT + 1 + OPTIONS.num_sample
-    assert len(votes) == 4 * (COUNT + 1)
+    assert len(compared) == COUNT + 1
+    assert found == by_heart(order)
 
 
 def test_other_features_and_other_options_are_not_taken_for_the_same(store):
     run(store, numbered(NAMES))
     changed = {**numbered(NAMES), NAMES[20]: COUNT + 1}
-    run(store, changed)
+    assert run(store, changed)[0] == by_heart(changed)
     for option, value in (("num_votes", 2), ("num_features", 20), ("num_candidates", 9)):
         how = {name: getattr(OPTIONS, name) for name in OPTIONS.__slots__} | {option: value}
-        run(store, numbered(NAMES), options=RetrievalOptions(**how))
+        other = RetrievalOptions(**how)
+        found, _ = run(store, numbered(NAMES), options=other)
+        assert found == by_heart(numbered(NAMES), options=other)
 
 
-@pytest.mark.parametrize("kind", ["described", "votes", "vocabulary"])
+@pytest.mark.parametrize("kind", ["described", "votes", "vocabulary", "kin"])
 def test_a_damaged_piece_is_worked_out_again(tmp_path, kind, caplog):
     path = tmp_path / "store.sqlite"
     with Store(path) as store:
         found, _ = run(store, numbered(NAMES))
     base = sqlite3.connect(path)
-    base.execute("DELETE FROM entry WHERE kind = 'retrieval'")
+    results = ("retrieval", "votes") if kind == "kin" else ("retrieval", "retrieval")
+    base.execute("DELETE FROM entry WHERE kind IN (?, ?)", results)
     rows = base.execute("SELECT id, value FROM entry WHERE kind = ?", (kind,)).fetchall()
     number, value = rows[len(rows) // 2]
     spoilt = value[:-70] + bytes([value[-70] ^ 1]) + value[-69:]

@@ -118,8 +118,7 @@ def recalls(team: TwiceMown, kind: str) -> Recalls:
     short, glances = stacked(described(frame, known, options) for frame in features)
     robots = np.zeros(len(features), dtype=np.int64)
     robots[team.num_first :] = 1
-    votes(short, glances, options)  # retrieval asks both ways: all frames, and other robots'
-    found = votes(short, glances, options, robots)
+    _, found = votes(short, glances, options, robots)
     seconds = time.perf_counter() - begin
     table = np.zeros((len(features), len(features)))
     table[tuple(found.pairs.T)] = found.weight

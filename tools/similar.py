@@ -1,20 +1,35 @@
 """Which pairs look alike, worked out for what is new only: piece by piece from the store.
 
 What is kept of a frame depends on its look and on what the sample taught; the votes that it casts
-on its candidates' looks besides. So one picture more costs its own description and the votes of
-those frames whose candidates it becomes, and no other frame's features are fetched again.
+on its candidates' looks besides. So one picture more costs its own description, a comparison with
+those frames whose candidates it becomes, and a new count of their votes; no other frame's features
+are fetched again.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
 
 from groundfuse.backend.measurement import FrameId
 from groundfuse.frontend.ahead import Result
 from groundfuse.frontend.features import Features
 from groundfuse.frontend.pairs import Pair, retrieved_pairs, sample_of
-from groundfuse.frontend.retrieval import Described, RetrievalOptions, Vocabulary
-from groundfuse.frontend.retrieval_votes import Cast, Indices
+from groundfuse.frontend.retrieval import (
+    Casts,
+    Compare,
+    Count,
+    Described,
+    Lists,
+    RetrievalOptions,
+    Vocabulary,
+    cast_for,
+)
+from groundfuse.frontend.retrieval_votes import Indices, Kin
 from groundfuse.tools.code_version import code_of
-from groundfuse.tools.packing import key_of
+from groundfuse.tools.packing import key_of, packed
 from groundfuse.tools.store import Store
 from groundfuse.tools.workers import in_threads
 
@@ -52,6 +67,19 @@ def similar_pairs(
     return [(order[i], order[j]) for i, j in found]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Table:
+    """How like a frame's features those of others are.
+
+    Attributes:
+        looks: (k, 20) keys of the others' looks.
+        nearest: (k, m) see `nearest_kin`.
+    """
+
+    looks: NDArray[np.uint8]
+    nearest: Kin
+
+
 class Pieces:
     """What retrieval works out, from the store where it was before; see `retrieval.Memory`.
 
@@ -86,13 +114,38 @@ class Pieces:
         keys = [key_of("described", self._taught, look) for look in self._looks]
         return self._each("described", keys, work)
 
-    def cast(self, near: Sequence[Indices], work: Callable[[int], Cast]) -> list[Cast]:
+    def cast(self, near: Sequence[Lists], kin: Compare, count: Count) -> list[Casts]:
         """Return every frame's votes: they depend on the looks of its candidates, too."""
         keys = []
-        for look, frames in zip(self._looks, near, strict=True):
-            others = b"".join(self._looks[k] for k in frames.tolist())
+        for look, lists in zip(self._looks, near, strict=True):
+            others = [b"".join(self._looks[k] for k in frames.tolist()) for frames in lists]
             keys.append(key_of("votes", self._taught, look, others))
+
+        def work(voter: int) -> Casts:
+            return cast_for(near[voter], partial(self._compared, voter, kin), count)
+
         return self._each("votes", keys, work)
+
+    def _compared(self, voter: int, kin: Compare, others: Indices) -> Kin:
+        """Return a frame's likeness to others, of which those are compared that are new.
+
+        What is kept is a table by the others' looks, of those that were asked for last.
+        """
+        key = key_of("kin", self._taught, self._looks[voter])
+        looks = np.array([tuple(self._looks[k]) for k in others.tolist()], np.uint8)
+        kept: _Table | None = self._store.load(key)
+        row_of = {} if kept is None else {look.tobytes(): k for k, look in enumerate(kept.looks)}
+        rows = np.array([row_of.get(look.tobytes(), -1) for look in looks], np.int64)
+        new = rows < 0
+        if kept is not None and not new.any():
+            return kept.nearest[rows]
+        if kept is None or new.all():
+            nearest = kin(voter, others)
+        else:
+            nearest = kept.nearest[rows]
+            nearest[new] = kin(voter, others[new])
+        self._store.save(key, "kin", self._names[voter], packed(_Table(looks, nearest)))
+        return nearest
 
     def _each(
         self, kind: str, keys: Sequence[bytes], work: Callable[[int], Result]
