@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 from groundfuse.backend.bundle_estimate import FocalGains
 from groundfuse.backend.measurement import FrameId, RelativePose
+from groundfuse.backend.ordering import stable_order
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -198,7 +199,7 @@ def tracks(links: Links, sightings: Sightings) -> tuple[Integers, Integers]:
     linked[links.a] = linked[links.b] = True
     used = np.flatnonzero(linked)
     place = label[used].astype(np.int64) * (sightings.frame.max() + 1) + sightings.frame[used]
-    order = np.argsort(place, kind="stable")
+    order = stable_order(place)
     same = np.diff(place[order]) == 0
     twice = np.zeros(len(used), dtype=np.bool_)
     twice[order[1:][same]] = twice[order[:-1][same]] = True
@@ -226,12 +227,13 @@ def observations(
     sightings: Sightings, used: Integers, point: Integers, num_frames: int
 ) -> Observations:
     """List the sightings by frame, with all pairs of sightings of a common floor point."""
-    order = np.lexsort((point, sightings.frame[used]))
+    size = np.bincount(point)
+    order = stable_order(sightings.frame[used] * len(size) + point)
     used, point = used[order], point[order]
-    frame = sightings.frame[used]
-    pair_i, pair_j = _pairs_within(point)
+    frame, by_point = sightings.frame[used], stable_order(point)
+    pair_i, pair_j = _pairs_within(by_point, size)
     key = frame[pair_i] * num_frames + frame[pair_j]
-    by_key = np.argsort(key, kind="stable")
+    by_key = stable_order(key)
     key = key[by_key]
     start = np.flatnonzero(np.diff(key, prepend=-1))
     pair_start, frame_start = (
@@ -241,11 +243,11 @@ def observations(
     return Observations(
         frame,
         point,
-        np.unique(point, return_index=True)[1],
+        by_point[np.cumsum(size) - size],
         sightings.ray[used],
         sightings.sigma[used],
         np.ones(len(used)) if sightings.gain is None else sightings.gain[used],
-        int(point.max()) + 1 if len(point) else 0,
+        len(size),
         frame_start,
         pair_i[by_key],
         pair_j[by_key],
@@ -254,13 +256,11 @@ def observations(
     )
 
 
-def _pairs_within(point: Integers) -> tuple[Integers, Integers]:
-    """All pairs i < j of observations of the same point."""
-    by_point = np.argsort(point, kind="stable")
-    size = np.bincount(point) if len(point) else np.zeros(0, dtype=np.int64)
+def _pairs_within(by_point: Integers, size: Integers) -> tuple[Integers, Integers]:
+    """All pairs i < j of observations of the same point, from those of each point in turn."""
     first = np.cumsum(size) - size
     some_i, some_j = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
-    for length in np.unique(size[size > 1]).tolist():
+    for length in np.flatnonzero(np.bincount(size)).tolist():
         i, j = np.triu_indices(length, 1)
         start = first[size == length][:, None]
         some_i.append(by_point[start + i].ravel())

@@ -7,7 +7,7 @@ finest. In between lies the homography of the floor, with each lens quadratic ov
 for linear, it moves a keypoint by hundredths of a pixel far out, as another focal length would.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from groundfuse.backend.measurement import Attitude, Se2
 from groundfuse.backend.option_checks import check_numbers
-from groundfuse.frontend.arrays import Floats, Image, Picture32, Points
+from groundfuse.backend.ordering import stable_order
+from groundfuse.frontend.arrays import Floats, Image, Mask, Picture32, Points
 from groundfuse.frontend.camera import Camera, Intrinsics
 from groundfuse.frontend.patches_compiled import fill_templates, lay_on
 from groundfuse.frontend.sight import cam_from_team
@@ -27,6 +28,7 @@ MOST_HALVINGS = 3
 """A picture eight times as fine as another is read from its last halving."""
 LATER = 0.25
 """A picture is halved where it is 1.7 times as fine as the other, not 1.4: reading blurs, too."""
+WAYS = ((1.0, 0.0), (0.0, 1.0))
 REACH = 0.5
 """Where in a patch a lens is asked how it goes on, in radii."""
 
@@ -115,15 +117,34 @@ def keypoints_of(
         point: (n,) floor point of each, numbered from 0, none left out.
     """
     cam_from_floor = _cam_from_floor(views)
-    on_floor = (np.linalg.inv(cam_from_floor)[view] @ _homogeneous(rays)[:, :, None])[:, :, 0]
-    floor = on_floor[:, :2] / on_floor[:, 2:]
+    x, y, z = _mapped(_inverse(cam_from_floor), view, rays)
+    floor = np.column_stack([x / z, y / z])
     # A homography's area grows with its determinant over depth cubed; the lens adds its own.
-    depth = (cam_from_floor[view, 2] * _homogeneous(floor)).sum(axis=1)
+    depth = _mapped(cam_from_floor, view, floor)[2]
     fineness = np.abs(np.linalg.det(cam_from_floor))[view] / np.abs(depth) ** 3
-    fineness *= np.abs(np.linalg.det(_through_lenses(views, view, rays, 1.0).by_ray))
-    order = np.lexsort((-fineness, point))
-    finest = order[np.searchsorted(point[order], np.arange(point.max() + 1))][point]
-    return Keypoints(view, rays, floor, fineness, finest)
+    fineness *= np.abs(_areas_by_ray(views, view, rays))
+    return Keypoints(view, rays, floor, fineness, _largest(fineness, point)[point])
+
+
+def _mapped(maps: Floats, which: Integers, points: Points) -> tuple[Floats, Floats, Floats]:
+    """Return what maps (views, 3, 3) make of points (n, 2), homogeneous: each has one of them."""
+    x, y = points.T
+    some = maps.reshape(-1, 9)[which].T
+    return (
+        some[0] * x + some[1] * y + some[2],
+        some[3] * x + some[4] * y + some[5],
+        some[6] * x + some[7] * y + some[8],
+    )
+
+
+def _largest(value: Floats, group: Integers) -> Integers:
+    """Return the place of the largest value of each group, of equal ones the first."""
+    order = stable_order(group)
+    begins = np.flatnonzero(np.diff(group[order], prepend=-1))
+    most = np.maximum.reduceat(value[order], begins)[group[order]]
+    largest = order[value[order] == most]
+    found: Integers = largest[np.flatnonzero(np.diff(group[largest], prepend=-1))]
+    return found
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -194,10 +215,6 @@ def _cam_from_floor(views: Sequence[PatchView]) -> Floats:
     return np.stack([cam_from_team(v.attitude, v.team_from_foot) for v in views])
 
 
-def _homogeneous(points: Points) -> Floats:
-    return np.column_stack([points, np.ones(len(points))])
-
-
 def _inverse(matrices: Floats) -> Floats:
     inverse: Floats = np.linalg.inv(matrices).astype(np.float64)
     return inverse
@@ -239,20 +256,42 @@ class _Lens(NamedTuple):
         return np.stack([xx, xy, yy], axis=2)
 
 
+def _areas_by_ray(views: Sequence[PatchView], view: Integers, rays: Points) -> Floats:
+    """Return how many square pixels the lenses make of what is around rays (n, 2), per unit."""
+    area = np.empty(len(rays))
+    for lens, mine in _by_lens(views, view):
+        step = 1.0 / lens.focal_px
+        (a_x, a_y), (b_x, b_y) = (_slope(lens, rays[mine], step, way).T for way in WAYS)
+        area[mine] = a_x * b_y - a_y * b_x
+    return area
+
+
 def _through_lenses(
     views: Sequence[PatchView], view: Integers, rays: Points, reach_px: float
 ) -> _Lens:
     """Send rays (n, 2) through lenses, with others at some pixels around them."""
-    lenses = [v.camera.intrinsics for v in views]
-    distinct = list(dict.fromkeys(lenses))
-    which = np.array([distinct.index(lens) for lens in lenses])[view]
     size = len(rays)
     found = _Lens(np.empty((size, 2)), np.empty((size, 2, 2)), np.empty((size, 2, 3)))
-    for number, lens in enumerate(distinct):
-        mine = which == number
+    for lens, mine in _by_lens(views, view):
         for whole, part in zip(found, _through(lens, rays[mine], reach_px), strict=True):
             whole[mine] = part
     return found
+
+
+def _by_lens(views: Sequence[PatchView], view: Integers) -> Iterator[tuple[Intrinsics, Mask]]:
+    """Yield every lens and which of the rays (n,) go through it."""
+    lenses = [v.camera.intrinsics for v in views]
+    number = {lens: k for k, lens in enumerate(dict.fromkeys(lenses))}
+    which = np.array([number[lens] for lens in lenses])[view]
+    for lens, k in number.items():
+        yield lens, which == k
+
+
+def _slope(lens: Intrinsics, rays: Points, step: float, way: tuple[float, float]) -> Points:
+    """Return how places (n, 2) move with their rays along a direction."""
+    off = step * np.array(way)
+    slope: Points = (lens.px_from_rays(rays + off) - lens.px_from_rays(rays - off)) / (2.0 * step)
+    return slope
 
 
 def _through(lens: Intrinsics, rays: Points, reach_px: float) -> _Lens:
@@ -264,7 +303,7 @@ def _through(lens: Intrinsics, rays: Points, reach_px: float) -> _Lens:
         ahead, behind = lens.px_from_rays(rays + way), lens.px_from_rays(rays - way)
         return (ahead - behind) / (2.0 * step), ((ahead + behind) / 2.0 - place) / step**2
 
-    (by_a, aa), (by_b, bb), (_, both) = ends((1.0, 0.0)), ends((0.0, 1.0)), ends((1.0, 1.0))
+    (by_a, aa), (by_b, bb), (_, both) = ends(WAYS[0]), ends(WAYS[1]), ends((1.0, 1.0))
     return _Lens(place, np.stack([by_a, by_b], axis=2), np.stack([aa, both - aa - bb, bb], axis=2))
 
 

@@ -11,6 +11,7 @@ BORDER = {
     "groundfuse.backend.compiled",
     "groundfuse.backend.measurement",
     "groundfuse.backend.option_checks",
+    "groundfuse.backend.ordering",
     "groundfuse.backend.reprojection",
     "groundfuse.backend.side_by_side",
 }

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from groundfuse.backend.measurement import FrameId
 from groundfuse.frontend.ahead import Result
@@ -72,11 +71,11 @@ class _Table:
     """How like a frame's features those of others are.
 
     Attributes:
-        looks: (k, 20) keys of the others' looks.
+        looks: keys of the others' looks.
         nearest: (k, m) see `nearest_kin`.
     """
 
-    looks: NDArray[np.uint8]
+    looks: tuple[bytes, ...]
     nearest: Kin
 
 
@@ -101,6 +100,7 @@ class Pieces:
         self._names = [str(frame) for frame in looks]
         self._looks = list(looks.values())
         self._num_threads = num_threads
+        self._code = code_of("groundfuse.tools.similar", rooms=("frontend", "tools"))
         sample = [looks[frame] for frame in sample_of(looks, options)]
         self._taught = key_of("taught", code_of("groundfuse.frontend.retrieval"), options, sample)
 
@@ -131,11 +131,11 @@ class Pieces:
 
         What is kept is a table by the others' looks, of those that were asked for last.
         """
-        key = key_of("kin", self._taught, self._looks[voter])
-        looks = np.array([tuple(self._looks[k]) for k in others.tolist()], np.uint8)
+        key = key_of("kin", self._code, self._taught, self._looks[voter])
+        looks = [self._looks[k] for k in others.tolist()]
         kept: _Table | None = self._store.load(key)
-        row_of = {} if kept is None else {look.tobytes(): k for k, look in enumerate(kept.looks)}
-        rows = np.array([row_of.get(look.tobytes(), -1) for look in looks], np.int64)
+        row_of = {} if kept is None else {look: row for row, look in enumerate(kept.looks)}
+        rows = np.array([row_of.get(look, -1) for look in looks], np.int64)
         new = rows < 0
         if kept is not None and not new.any():
             return kept.nearest[rows]
@@ -144,7 +144,7 @@ class Pieces:
         else:
             nearest = kept.nearest[rows]
             nearest[new] = kin(voter, others[new])
-        self._store.save(key, "kin", self._names[voter], packed(_Table(looks, nearest)))
+        self._store.save(key, "kin", self._names[voter], packed(_Table(tuple(looks), nearest)))
         return nearest
 
     def _each(
