@@ -7,6 +7,8 @@ import cv2
 import numpy as np
 import pytest
 from analytic_floor import floor_of_pixels, make_camera, picture, rounded, waves
+from hypothesis import given
+from hypothesis import strategies as st
 
 from groundfuse.backend.measurement import Attitude, Se2
 from groundfuse.frontend import patches
@@ -14,6 +16,7 @@ from groundfuse.frontend.overhead import floor_from_rays, rays_from_floor
 from groundfuse.frontend.patches import (
     PatchOptions,
     PatchView,
+    _largest,
     _weight,
     aligned,
     empty_templates,
@@ -285,6 +288,43 @@ def test_the_finest_picture_is_the_one_that_is_nearest():
     assert np.allclose(points.floor, np.vstack([floor, floor]))
     # At half the height pixels lie half as far apart.
     assert np.allclose(points.fineness[2:] / points.fineness[:2], 4.0, rtol=0.1)
+
+
+@pytest.mark.parametrize("coefficients", [(), BARREL], ids=["pinhole", "barrel"])
+def test_fineness_is_how_many_pixels_a_piece_of_floor_has(coefficients):
+    """By the corners of small squares on the floor, sent through attitude and lens."""
+    camera = make_camera(coefficients=coefficients)
+    attitude, lens = camera.mount.attitude, camera.intrinsics
+    view = PatchView(camera, attitude, Se2(0.0, 0.0, 0.0), lambda: None)
+    across, down = np.meshgrid(np.linspace(20, lens.width_px - 20, 5), [15.0, 100.0])
+    rays = lens.rays_from_px(np.column_stack([across.ravel(), down.ravel()]))
+    middle = floor_from_rays(attitude, rays)
+    found = keypoints_of([view], np.zeros(10, np.int64), rays, np.arange(10)).fineness
+
+    def px(offset_m):
+        return lens.px_from_rays(rays_from_floor(attitude, middle + offset_m))
+
+    half_m = 1e-4
+    by_x = px(np.array([half_m, 0.0])) - px(np.array([-half_m, 0.0]))
+    by_y = px(np.array([0.0, half_m])) - px(np.array([0.0, -half_m]))
+    area_px = np.abs(by_x[:, 0] * by_y[:, 1] - by_x[:, 1] * by_y[:, 0]) / (2.0 * half_m) ** 2
+    # Fineness may have any unit; slopes are taken over a pixel.
+    ratio = found / area_px
+    np.testing.assert_allclose(ratio / ratio[0], 1.0, rtol=1e-3)
+
+
+@given(st.lists(st.integers(0, 5), min_size=1, max_size=40), st.randoms(use_true_random=False))
+def test_the_largest_of_each_group_is_the_first_of_equal_ones(values, random):
+    numbers = list(range(1 + max(1, len(values) // 4)))
+    group = [random.choice(numbers) for _ in values]
+    present = sorted(set(group))
+    group = np.array([present.index(number) for number in group])
+    found = _largest(np.array(values, np.float64), group)
+    expected = [
+        max(np.flatnonzero(group == k).tolist(), key=lambda place: (values[place], -place))
+        for k in range(len(present))
+    ]
+    assert found.tolist() == expected
 
 
 def test_reading_between_pixels_is_bilinear():
