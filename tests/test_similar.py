@@ -125,6 +125,9 @@ def test_who_votes_anew_and_who_is_compared_follows_from_the_lists(compared, sto
     compared.clear()
     run(store, order)
     assert compared == []  # the votes of the first run are there still
+    for frame in [frame for frame in left if frame not in sample_of(NAMES, OPTIONS)][::4]:
+        del left[frame]
+        assert run(store, left)[0] == by_heart(left)
 
 
 def test_a_frame_that_is_gone_costs_no_reading(store):

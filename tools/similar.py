@@ -6,14 +6,16 @@ those frames whose candidates it becomes, and a new count of their votes; no oth
 are fetched again.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 
 import numpy as np
 
 from groundfuse.backend.measurement import FrameId
 from groundfuse.frontend.ahead import Result
+from groundfuse.frontend.arrays import Mask
 from groundfuse.frontend.features import Features
 from groundfuse.frontend.pairs import Pair, retrieved_pairs, sample_of
 from groundfuse.frontend.retrieval import (
@@ -25,11 +27,12 @@ from groundfuse.frontend.retrieval import (
     RetrievalOptions,
     Vocabulary,
     cast_for,
+    every_candidate,
 )
-from groundfuse.frontend.retrieval_votes import Indices, Kin
+from groundfuse.frontend.retrieval_votes import Kin
 from groundfuse.tools.code_version import code_of
 from groundfuse.tools.packing import key_of, packed
-from groundfuse.tools.store import Store
+from groundfuse.tools.store import TOGETHER, Store
 from groundfuse.tools.workers import in_threads
 
 
@@ -68,7 +71,7 @@ def similar_pairs(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Table:
-    """How like a frame's features those of others are.
+    """How like a frame's features those of others are: the ones that it was last asked of.
 
     Attributes:
         looks: keys of the others' looks.
@@ -121,31 +124,31 @@ class Pieces:
             others = [b"".join(self._looks[k] for k in frames.tolist()) for frames in lists]
             keys.append(key_of("votes", self._taught, look, others))
 
-        def work(voter: int) -> Casts:
-            return cast_for(near[voter], partial(self._compared, voter, kin), count)
+        def vote(item: tuple[int, _Table | None]) -> tuple[Casts, bytes | None]:
+            voter, kept = item
+            every = every_candidate(near[voter])
+            looks = tuple(self._looks[k] for k in every.tolist())
+            table = _completed(kept, looks, lambda new: kin(voter, every[new]))
+            casts = cast_for(near[voter], lambda _: table.nearest, count)
+            return casts, None if table is kept else packed(table)
 
-        return self._each("votes", keys, work)
+        return self._store.kept_each("votes", self._names, keys, partial(self._voted, vote))
 
-    def _compared(self, voter: int, kin: Compare, others: Indices) -> Kin:
-        """Return a frame's likeness to others, of which those are compared that are new.
-
-        What is kept is a table by the others' looks, of those that were asked for last.
-        """
-        key = key_of("kin", self._code, self._taught, self._looks[voter])
-        looks = [self._looks[k] for k in others.tolist()]
-        kept: _Table | None = self._store.load(key)
-        row_of = {} if kept is None else {look: row for row, look in enumerate(kept.looks)}
-        rows = np.array([row_of.get(look, -1) for look in looks], np.int64)
-        new = rows < 0
-        if kept is not None and not new.any():
-            return kept.nearest[rows]
-        if kept is None or new.all():
-            nearest = kin(voter, others)
-        else:
-            nearest = kept.nearest[rows]
-            nearest[new] = kin(voter, others[new])
-        self._store.save(key, "kin", self._names[voter], packed(_Table(tuple(looks), nearest)))
-        return nearest
+    def _voted(
+        self,
+        vote: Callable[[tuple[int, "_Table | None"]], tuple[Casts, bytes | None]],
+        voters: Sequence[int],
+    ) -> Iterator[Casts]:
+        """Let frames vote, each with what it was compared with before, and write that down."""
+        left = iter(voters)
+        while some := list(islice(left, TOGETHER)):
+            keys = [key_of("kin", self._code, self._taught, self._looks[k]) for k in some]
+            items = zip(some, self._store.load_all(keys), strict=True)
+            voted = list(in_threads(vote, items, self._num_threads))
+            names = [self._names[k] for k in some]
+            tables = zip(keys, names, (table for _, table in voted), strict=True)
+            self._store.save_all("kin", [(k, n, data) for k, n, data in tables if data is not None])
+            yield from (casts for casts, _ in voted)
 
     def _each(
         self, kind: str, keys: Sequence[bytes], work: Callable[[int], Result]
@@ -154,3 +157,20 @@ class Pieces:
             return in_threads(work, places, self._num_threads)
 
         return self._store.kept_each(kind, self._names, keys, works)
+
+
+def _completed(
+    kept: _Table | None, looks: tuple[bytes, ...], compare: Callable[[Mask], Kin]
+) -> _Table:
+    """Return a frame's likeness to these looks, of which those are compared that are new."""
+    if kept is not None and kept.looks == looks:
+        return kept
+    row_of = {} if kept is None else {look: row for row, look in enumerate(kept.looks)}
+    rows = np.array([row_of.get(look, -1) for look in looks], np.int64)
+    new = rows < 0
+    if kept is None or new.all():
+        return _Table(looks, compare(new))
+    nearest = kept.nearest[rows]
+    if new.any():
+        nearest[new] = compare(new)
+    return _Table(looks, nearest)

@@ -170,10 +170,15 @@ class Store:
         Raises:
             DataError: the disk is full, or fails; what is there already stays.
         """
-        self._save_all(kind, [(key, label, value)])
+        self.save_all(kind, [(key, label, value)])
 
-    def _save_all(self, kind: str, entries: Sequence[tuple[bytes, str, bytes]]) -> None:
-        """Keep packed values of a kind, all or, where the process ends, none."""
+    def save_all(self, kind: str, entries: Sequence[tuple[bytes, str, bytes]]) -> None:
+        """Keep packed values of a kind, all or, where the process ends, none; else as `save`.
+
+        Args:
+            kind: what they are.
+            entries: key, label and value of each.
+        """
         insert = "INSERT OR REPLACE INTO entry(key, kind, label, run, value) VALUES (?, ?, ?, ?, ?)"
         rows = [
             (key, kind, label.encode(errors="replace").decode(), self._run, value)
@@ -234,7 +239,7 @@ class Store:
         missing = [place for place, value in enumerate(found) if value is None]
         made = zip(missing, works(missing), strict=True)
         while part := [(place, packed(value)) for place, value in islice(made, TOGETHER)]:
-            self._save_all(kind, [(keys[place], labels[place], data) for place, data in part])
+            self.save_all(kind, [(keys[place], labels[place], data) for place, data in part])
             for place, data in part:
                 found[place] = unpacked(data)
         return found
