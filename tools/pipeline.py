@@ -30,6 +30,7 @@ from groundfuse.tools.aligned_keypoints import Desk, aligned_keypoints
 from groundfuse.tools.code_version import code_of
 from groundfuse.tools.front_end import FrontEnd, FrontEndResult
 from groundfuse.tools.front_end_options import FrontEndOptions
+from groundfuse.tools.memory import give_back
 from groundfuse.tools.packing import key_of
 from groundfuse.tools.robot import Frame, Robot
 from groundfuse.tools.second_look import as_filed, corrected, is_worth_it
@@ -39,6 +40,9 @@ from groundfuse.tools.team_graphs import Graphs, accepted_edges, solved_graphs
 from groundfuse.tools.workers import Progress, Threads, Workers
 
 log = logging.getLogger(__name__)
+
+LONG_S = 2.0
+"""A stage that took longer leaves memory behind that is worth giving back."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,7 +71,10 @@ class PipelineOptions:
 
 @dataclass(slots=True)
 class Stopwatch:
-    """Seconds per stage, in the order in which the stages ended."""
+    """Seconds per stage, in the order in which the stages ended.
+
+    After one that took long, what is free of its memory goes back to the system.
+    """
 
     seconds: dict[str, float] = field(default_factory=dict)
     _within_s: float = 0.0
@@ -83,6 +90,8 @@ class Stopwatch:
             took = time.perf_counter() - begin
             self.seconds[name] = self.seconds.get(name, 0.0) + took - self._within_s
             self._within_s = before + took
+            if took > LONG_S:
+                give_back()
 
 
 @dataclass(frozen=True, slots=True)
