@@ -2,14 +2,15 @@
 
     bench_stitcher.py --sizes 10 25 50 100 --seed 300
 
-One robot drives over terrazzo; the first n pictures are given to both. The main job runs once before
-the stitcher and once after it, and its times are the means of both: the speed of a machine may
-change meanwhile. (The first of all also loads its compiled code.) The stitcher expects pictures of
-something flat from straight above, so it gets the overhead views at each picture's filed attitude,
-with their masks; making them is not counted. Both make a picture with cells of the same size, that
-of the overhead views (with `--own-cell`, the main job makes the finer one that it makes by itself).
-Positions of the camera's foot are compared with the truth after the best similarity (the stitcher
-knows no scale), over the pictures that each of them kept. Run it on an otherwise idle machine.
+One robot drives over terrazzo; the first n pictures are given to both. The main job runs once
+before the stitcher and once after it, and its times are the means of both: the speed of a machine
+may change meanwhile. (The first of all also loads its compiled code.) The stitcher expects pictures
+of something flat from straight above, so it gets the overhead views at each picture's filed
+attitude, with their masks; making them is not counted. Both make a picture with cells of the same
+size, that of the overhead views (with `--own-cell`, the main job makes the finer one that it makes
+by itself). Positions of the camera's foot are compared with the truth after the best similarity
+(the stitcher knows no scale), over the pictures that each of them kept. Run it on an otherwise idle
+machine.
 """
 
 import argparse
