@@ -176,7 +176,6 @@ def _robust_fit(floor: _Floor) -> tuple[Floats, Floats]:
         gain, falloff = _solve(floor, weight)
         if np.abs(gain - before).max() < STILL:
             break
-
         _fill_distances(floor, weight, (gain, falloff), distance)
         scale = max(MAD_TO_SIGMA * float(middle(distance)), SMALLEST_SCALE)
         weight = 1.0 / (1.0 + (distance / scale) ** 2)
@@ -271,9 +270,8 @@ def _noise(floor: _Floor, point: Floats, gain: Floats, falloff: Floats) -> float
     fall = radius2 * (c1 + radius2 * (c2 + radius2 * c3))
     even = point * np.exp(-fall)[:, None] * np.exp(-gain)[view]
     difference = np.abs(np.diff(even, axis=0))
-    across = (
-        floor.places[0][1:-1].astype(np.intp) - 1
-    )  # from the last view of a cell to the first of the next
+    # From the last view of a cell to the first of the next.
+    across = floor.places[0][1:-1].astype(np.intp) - 1
     difference = np.delete(difference, across, axis=0)
     sigma = MAD_TO_SIGMA * float(middle(difference.ravel())) / np.sqrt(2.0)
     return max(float(sigma), SMALLEST_NOISE_LEVELS)
