@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
+from groundfuse.backend.ordering import stable_order
 from groundfuse.backend.side_by_side import side_by_side
 from groundfuse.frontend.arrays import Floats
 from groundfuse.frontend.camera import Intrinsics
@@ -115,7 +116,7 @@ def estimate_exposure(samples: Samples, lens_of_view: Numbers) -> Exposure:
     if not shared.any():
         return neutral_exposure(len(lens_of_view))
     by_cell_and_view = cell[shared] * len(lens_of_view) + samples.view[shared]
-    order = np.flatnonzero(shared)[np.argsort(by_cell_and_view, kind="stable")]
+    order = np.flatnonzero(shared)[stable_order(by_cell_and_view)]
     floor = _floor(samples, order, seen[seen > 1], lens_of_view)
     gain, falloff = _robust_fit(floor)
     noise_levels = _noise(floor, samples.point[order], gain, falloff)
@@ -144,7 +145,7 @@ def _floor(samples: Samples, order: Numbers, number: Numbers, lens_of_view: Numb
     view, num_views = samples.view[order], len(lens_of_view)
     values = np.log(np.maximum(samples.colour[order], 1.0))
     begins, cell = _ends(number), np.repeat(np.arange(len(number)), number)
-    by_view, first = np.argsort(view, kind="stable"), _ends(np.bincount(view, minlength=num_views))
+    by_view, first = stable_order(view), _ends(np.bincount(view, minlength=num_views))
     seen = sparse.csr_array((np.ones(len(view), np.bool_), view, begins), (len(number), num_views))
     together = (seen.T @ seen).tocsr()
     together.sort_indices()

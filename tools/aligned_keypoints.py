@@ -13,6 +13,7 @@ from groundfuse.backend.bundle import LEAST_SIGHTINGS
 from groundfuse.backend.bundle_sample import sampled
 from groundfuse.backend.bundle_tracks import Links, Matched, Sightings, matched, mixed_keys, tracks
 from groundfuse.backend.measurement import Array, FrameId, RelativePose, TeamEstimate
+from groundfuse.backend.ordering import stable_order
 from groundfuse.frontend.arrays import Image
 from groundfuse.frontend.patches import (
     Aligned,
@@ -232,7 +233,7 @@ def _align_part(
 
 def _by(number: Integers) -> list[Integers]:
     """Return the places of each number that occurs, in the order of the numbers."""
-    order = np.argsort(number, kind="stable")
+    order = stable_order(number)
     return np.split(order, np.flatnonzero(np.diff(number[order])) + 1)
 
 
