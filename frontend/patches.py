@@ -261,7 +261,7 @@ def _areas_by_ray(views: Sequence[PatchView], view: Integers, rays: Points) -> F
     area = np.empty(len(rays))
     for lens, mine in _by_lens(views, view):
         step = 1.0 / lens.focal_px
-        (a_x, a_y), (b_x, b_y) = (_slope(lens, rays[mine], step, way).T for way in WAYS)
+        (a_x, a_y), (b_x, b_y) = (_around(lens, rays[mine], step, way)[0].T for way in WAYS)
         area[mine] = a_x * b_y - a_y * b_x
     return area
 
@@ -287,23 +287,24 @@ def _by_lens(views: Sequence[PatchView], view: Integers) -> Iterator[tuple[Intri
         yield lens, which == k
 
 
-def _slope(lens: Intrinsics, rays: Points, step: float, way: tuple[float, float]) -> Points:
-    """Return how places (n, 2) move with their rays along a direction."""
+def _around(
+    lens: Intrinsics, rays: Points, step: float, way: tuple[float, float]
+) -> tuple[Points, Points]:
+    """Return how places (n, 2) move with their rays along a direction, and the ends' mean."""
     off = step * np.array(way)
-    slope: Points = (lens.px_from_rays(rays + off) - lens.px_from_rays(rays - off)) / (2.0 * step)
-    return slope
+    ahead, behind = lens.px_from_rays(rays + off), lens.px_from_rays(rays - off)
+    return (ahead - behind) / (2.0 * step), (ahead + behind) / 2.0
 
 
 def _through(lens: Intrinsics, rays: Points, reach_px: float) -> _Lens:
     place, step = lens.px_from_rays(rays), reach_px / lens.focal_px
 
-    def ends(direction: tuple[float, float]) -> tuple[Points, Points]:
+    def bent(way: tuple[float, float]) -> tuple[Points, Points]:
         """Return the slope along a direction, and half the curvature."""
-        way = step * np.array(direction)
-        ahead, behind = lens.px_from_rays(rays + way), lens.px_from_rays(rays - way)
-        return (ahead - behind) / (2.0 * step), ((ahead + behind) / 2.0 - place) / step**2
+        slope, mean = _around(lens, rays, step, way)
+        return slope, (mean - place) / step**2
 
-    (by_a, aa), (by_b, bb), (_, both) = ends(WAYS[0]), ends(WAYS[1]), ends((1.0, 1.0))
+    (by_a, aa), (by_b, bb), (_, both) = bent(WAYS[0]), bent(WAYS[1]), bent((1.0, 1.0))
     return _Lens(place, np.stack([by_a, by_b], axis=2), np.stack([aa, both - aa - bb, bb], axis=2))
 
 
