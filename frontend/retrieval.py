@@ -11,7 +11,6 @@ fro sees its own floor in more frames than any list holds, and those look more a
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -154,7 +153,11 @@ class Forgetful:
 
     def cast(self, near: Sequence[Lists], kin: Compare, count: Count) -> list[Casts]:
         """Let every frame vote."""
-        return [cast_for(lists, partial(kin, k), count) for k, lists in enumerate(near)]
+        every = map(every_candidate, near)
+        return [
+            cast_for(lists, others, kin(k, others), count)
+            for k, (lists, others) in enumerate(zip(near, every, strict=True))
+        ]
 
 
 def learned(sample: Iterable[Features], options: RetrievalOptions) -> Vocabulary | None:
@@ -208,10 +211,8 @@ def votes(
     ]
 
 
-def cast_for(lists: Lists, kin: Callable[[Indices], Kin], count: Count) -> Casts:
-    """Return one frame's votes for each list of candidates; each is compared once."""
-    every = every_candidate(lists)
-    nearest = kin(every)
+def cast_for(lists: Lists, every: Indices, nearest: Kin, count: Count) -> Casts:
+    """Return one frame's votes for each list of candidates, compared once with `every` of them."""
     return tuple(count(nearest[np.searchsorted(every, near)]) for near in lists)
 
 

@@ -129,7 +129,7 @@ class Pieces:
             every = every_candidate(near[voter])
             looks = tuple(self._looks[k] for k in every.tolist())
             table = _completed(kept, looks, lambda new: kin(voter, every[new]))
-            casts = cast_for(near[voter], lambda _: table.nearest, count)
+            casts = cast_for(near[voter], every, table.nearest, count)
             return casts, None if table is kept else packed(table)
 
         return self._store.kept_each("votes", self._names, keys, partial(self._voted, vote))
