@@ -1,9 +1,11 @@
 """Values become bytes and come back the same to the bit; nothing else comes out of bytes."""
 
+import hashlib
 import json
 import math
 import pickle
 import struct
+import zlib
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -136,7 +138,7 @@ def sealed(outline):
     """Bytes with a right checksum around any outline."""
     text = json.dumps(outline).encode()
     body = struct.pack("<I", len(text)) + text
-    return packing._checksum(body) + body
+    return packing._checksum([body]) + body
 
 
 @pytest.mark.parametrize(
@@ -184,3 +186,17 @@ def test_keys_tell_values_apart():
     assert key_of("look", CAMERA) == key_of("look", unpacked(packed(CAMERA)))
     assert len(key_of()) == len(digest_of(b"")) == 20
     assert digest_of(b"a") != digest_of(b"b")
+
+
+def test_keys_stay_as_they_are():
+    """Else nothing would be found of what a store has."""
+    found = key_of("look", (1, 2.5, None), np.arange(4.0), Se2(1.0, 2.0, 3.0))
+    assert found.hex() == "f094c7dc0aa66a1e06d4d01b9850f6a710f6ac68"
+
+
+def test_either_checksum_is_known_and_the_quick_one_is_written():
+    body = packed(edge())[packing.CHECKSUM_BYTES :]
+    assert packed(edge())[:8] == struct.pack("<II", zlib.crc32(body), len(body))
+    digest = hashlib.blake2b(body, digest_size=8).digest()
+    assert packed(unpacked(digest + body)) == packed(edge())
+    assert not is_whole(digest + body[:-1] + bytes([body[-1] ^ 1]))

@@ -1,5 +1,6 @@
 """A store keeps what it acknowledged, is held by one process, and refuses what is not its own."""
 
+import hashlib
 import os
 import signal
 import socket
@@ -10,6 +11,7 @@ import threading
 
 import pytest
 
+from groundfuse.tools import packing
 from groundfuse.tools import store as module
 from groundfuse.tools.errors import DataError
 from groundfuse.tools.packing import key_of, packed
@@ -271,11 +273,26 @@ def test_another_version_is_refused_with_both_numbers(path):
         pass
     rows(path, "PRAGMA user_version = 7")
     assert refusal(path) == (
-        f"{path}: store of version 7, this groundfuse reads 1: "
+        f"{path}: store of version 7, this groundfuse reads 2: "
         "use the groundfuse that wrote it, or start over with --fresh"
     )
     with Store(path, fresh=True) as store:
         put(store, 1)
+
+
+def test_a_store_of_version_1_is_taken_over(path, caplog):
+    """Its entries, under a digest for a checksum, are found; its groundfuse refuses it then."""
+    with Store(path) as store:
+        put(store, "x" * 500)
+        body = packed("y" * 500)[packing.CHECKSUM_BYTES :]
+        store.save(b"old", "number", "A2", hashlib.blake2b(body, digest_size=8).digest() + body)
+    rows(path, "PRAGMA user_version = 1")
+    with Store(path) as store:
+        assert store.load(b"old") == "y" * 500
+        assert store.load(b"k") == "x" * 500
+        put(store, 2)
+    assert rows(path, "PRAGMA user_version") == [(2,)]
+    assert not caplog.messages
 
 
 def test_a_damaged_entry_is_named_and_counts_as_missing(path, caplog):

@@ -31,7 +31,9 @@ log = logging.getLogger(__name__)
 STORE = "store.sqlite"
 """Its usual name, in the out folder."""
 APPLICATION = 0x67667573  # "gfus"
-VERSION = 1
+VERSION = 2
+EARLIER = frozenset({0, 1})
+"""A new file, and stores whose entries may stay as they are: those of 1 have another checksum."""
 SYNC_S = 5.0
 TOGETHER = 256
 """Entries that are fetched with one question."""
@@ -274,6 +276,8 @@ def _opened(path: Path | None) -> sqlite3.Connection:
         if found == 0:  # before there is a log: a killed process must leave nothing or a store
             head = f"PRAGMA application_id={APPLICATION}; PRAGMA user_version={VERSION};"
             base.executescript(f"BEGIN; {TABLES} {head} COMMIT;")
+        elif found != VERSION:  # its groundfuse would take new entries for damaged ones
+            base.execute(f"PRAGMA user_version={VERSION}")
         base.execute("PRAGMA journal_mode=WAL")
         base.execute("PRAGMA wal_autocheckpoint=4096")
     except BaseException:
@@ -287,7 +291,7 @@ def _marks(values: Sequence[object]) -> str:
 
 
 def _check_version(path: Path | None, found: int) -> None:
-    if found not in (0, VERSION):
+    if found != VERSION and found not in EARLIER:
         raise DataError(
             f"{path}: store of version {found}, this groundfuse reads {VERSION}: "
             "use the groundfuse that wrote it, or start over with --fresh"
