@@ -15,7 +15,6 @@ import hashlib
 import importlib
 import itertools
 import json
-import math
 import operator
 import struct
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -234,12 +233,12 @@ def _maker(name: str) -> Callable[..., Any]:
     if not hasattr(kind, "__post_init__"):
         plain: Callable[..., Any] = kind
         return plain
-    words = [field.name for field in fields(kind)]
+    words, new, put = [field.name for field in fields(kind)], object.__new__, object.__setattr__
 
     def made(*parts: Any) -> Any:  # noqa: ANN401
-        value = object.__new__(kind)
+        value = new(kind)
         for word, part in zip(words, parts, strict=True):
-            object.__setattr__(value, word, part)
+            put(value, word, part)
         return value
 
     return made
@@ -250,10 +249,10 @@ def _value(outline: Any, arrays: memoryview) -> Any:  # noqa: ANN401, PLR0911
     if type(outline) is not list:
         return outline
     kind = outline[0]
-    if kind == "O":
-        return _maker(outline[1])(*_values(outline[2:], arrays))
     if kind == "A":
         return _array(arrays, *outline[1:])
+    if kind == "O":
+        return _maker(outline[1])(*_values(outline[2:], arrays))
     if kind == "B":
         return bytes.fromhex(outline[1])
     if kind == "E":
@@ -274,10 +273,18 @@ def _values(outlines: list[Any], arrays: memoryview) -> list[Any]:
 
 
 def _array(arrays: memoryview, kind: str, shape: list[int], start: int) -> np.ndarray[Any, Any]:
+    dtype = _dtype(kind)
+    if 0 in shape:  # may lie behind the end
+        return np.zeros(shape, dtype)
+    if start < 0:  # numpy looks for the other end only
+        raise ValueError("offset must be non-negative")
+    found: np.ndarray[Any, Any] = np.ndarray(shape, dtype, arrays, start).copy()
+    return found
+
+
+@functools.cache
+def _dtype(kind: str) -> np.dtype[Any]:
     dtype = np.dtype(kind)
     if dtype.kind not in "biufc":
         raise ValueError(f"arrays of {kind} are not known")
-    count = math.prod(shape)
-    if count == 0:
-        return np.zeros(shape, dtype)
-    return np.frombuffer(arrays, dtype, count, start).reshape(shape).copy()
+    return dtype

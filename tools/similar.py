@@ -74,12 +74,17 @@ class _Table:
     """How like a frame's features those of others are: the ones that it was last asked of.
 
     Attributes:
-        looks: keys of the others' looks.
+        looks: keys of the others' looks, one after the other: a hundred of them are read as one.
         nearest: (k, m) see `nearest_kin`.
     """
 
-    looks: tuple[bytes, ...]
+    looks: bytes
     nearest: Kin
+
+    def row_of(self) -> dict[bytes, int]:
+        """Return the row of each look."""
+        size = len(self.looks) // max(len(self.nearest), 1)
+        return {self.looks[k * size : (k + 1) * size]: k for k in range(len(self.nearest))}
 
 
 class Pieces:
@@ -127,7 +132,7 @@ class Pieces:
         def vote(item: tuple[int, _Table | None]) -> tuple[Casts, bytes | None]:
             voter, kept = item
             every = every_candidate(near[voter])
-            looks = tuple(self._looks[k] for k in every.tolist())
+            looks = [self._looks[k] for k in every.tolist()]
             table = _completed(kept, looks, lambda new: kin(voter, every[new]))
             casts = cast_for(near[voter], every, table.nearest, count)
             return casts, None if table is kept else packed(table)
@@ -160,17 +165,18 @@ class Pieces:
 
 
 def _completed(
-    kept: _Table | None, looks: tuple[bytes, ...], compare: Callable[[Mask], Kin]
+    kept: _Table | None, looks: Sequence[bytes], compare: Callable[[Mask], Kin]
 ) -> _Table:
     """Return a frame's likeness to these looks, of which those are compared that are new."""
-    if kept is not None and kept.looks == looks:
+    joined = b"".join(looks)
+    if kept is not None and kept.looks == joined:
         return kept
-    row_of = {} if kept is None else {look: row for row, look in enumerate(kept.looks)}
+    row_of = {} if kept is None else kept.row_of()
     rows = np.array([row_of.get(look, -1) for look in looks], np.int64)
     new = rows < 0
     if kept is None or new.all():
-        return _Table(looks, compare(new))
+        return _Table(joined, compare(new))
     nearest = kept.nearest[rows]
     if new.any():
         nearest[new] = compare(new)
-    return _Table(looks, nearest)
+    return _Table(joined, nearest)
