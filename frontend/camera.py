@@ -16,7 +16,9 @@ import numpy as np
 
 from groundfuse.backend.measurement import IDENTITY, Attitude, Se2
 from groundfuse.frontend.arrays import Points
+from groundfuse.frontend.lens_compiled import fisheye_px, plumb_bob_px
 
+MOST_COEFFICIENTS = 8
 NEWTON_STEPS = 5
 RAY_STEP = 1e-6
 SOLVED_PX = 1e-6
@@ -117,33 +119,13 @@ class Intrinsics:
 
     def px_from_rays(self, rays: Points) -> Points:
         """Project rays (n, 2) to distorted pixels (n, 2); nan stays nan."""
-        if self.is_pinhole:
-            pinhole = np.empty(rays.shape)  # column by column: rows of two are slow to walk
-            pinhole[:, 0] = rays[:, 0] * self.fx_px + self.cx_px
-            pinhole[:, 1] = rays[:, 1] * self.fy_px + self.cy_px
-            return pinhole
-        if self.model is Distortion.EQUIDISTANT:
-            return self._fisheye_px(rays)
-        return self._plumb_bob_px(rays)
-
-    def _fisheye_px(self, rays: Points) -> Points:
-        radius = np.hypot(rays[:, 0], rays[:, 1])
-        angle = np.arctan(radius)
-        powers = np.stack([angle ** (2 * k) for k in range(5)], axis=1)
-        distorted = angle * (powers @ np.array([1.0, *self._at_least_four]))
-        factor = np.divide(distorted, radius, out=np.ones_like(radius), where=radius > 0.0)
-        focal, centre = np.array([self.fx_px, self.fy_px]), np.array([self.cx_px, self.cy_px])
-        pixels: Points = rays * factor[:, None] * focal + centre
-        return pixels
-
-    def _plumb_bob_px(self, rays: Points) -> Points:
-        k1, k2, p1, p2, k3, k4, k5, k6 = (*self.coefficients, *(0.0,) * 8)[:8]
-        x, y = rays[:, 0], rays[:, 1]
-        r2 = x * x + y * y
-        radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-        u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-        v = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-        return np.stack([self.fx_px * u + self.cx_px, self.fy_px * v + self.cy_px], axis=1)
+        scale = np.array([self.fx_px, self.fy_px, self.cx_px, self.cy_px])
+        coefficients = np.zeros(MOST_COEFFICIENTS)
+        coefficients[: len(self.coefficients)] = self.coefficients
+        rays, px = np.ascontiguousarray(rays, dtype=np.float64), np.empty(rays.shape)
+        project = fisheye_px if self.model is Distortion.EQUIDISTANT else plumb_bob_px
+        project(rays, scale, coefficients, px)
+        return px
 
 
 @dataclass(frozen=True, slots=True)
