@@ -23,6 +23,7 @@ from groundfuse.frontend.gains_compiled import (
     CHANNELS,
     POWERS,
     cell_sums,
+    differences,
     distances,
     view_rows,
 )
@@ -127,15 +128,16 @@ class _Floor(NamedTuple):
     """Samples in order of their cells, and of the views in a cell.
 
     Attributes:
-        seen: views (n,), their lenses (n,), radius2 (n,) as in `Samples`, and logarithms of the
-            colours (n, 3).
+        seen: see `cell_sums`; the values are logarithms.
+        begins: see `cell_sums`.
         places: see `view_rows`.
         pattern: see `view_rows`.
         lens_of_view: (views,).
     """
 
     seen: tuple[Short, Short, Floats, Floats]
-    places: tuple[Short, Short, Short, Short]
+    begins: tuple[Short, Short, Short]
+    places: tuple[Short, Short, Short]
     pattern: tuple[Short, Short]
     lens_of_view: Numbers
 
@@ -143,15 +145,20 @@ class _Floor(NamedTuple):
 def _floor(samples: Samples, order: Numbers, number: Numbers, lens_of_view: Numbers) -> _Floor:
     """Return samples in their `order`, so many of each cell."""
     view, num_views = samples.view[order], len(lens_of_view)
-    values = np.log(np.maximum(samples.colour[order], 1.0))
+    lens, values = lens_of_view[view], np.log(np.maximum(samples.colour[order], 1.0))
     begins, cell = _ends(number), np.repeat(np.arange(len(number)), number)
-    by_view, first = stable_order(view), _ends(np.bincount(view, minlength=num_views))
-    seen = sparse.csr_array((np.ones(len(view), np.bool_), view, begins), (len(number), num_views))
-    together = (seen.T @ seen).tocsr()
+    is_first = np.append(True, (np.diff(cell) > 0) | (np.diff(lens) != 0))
+    of_run = np.append(np.flatnonzero(is_first), len(view))
+    runs_of_cell = np.searchsorted(of_run, begins)
+    shape = len(number), num_views
+    by_view = sparse.csr_array((np.arange(len(view)), view, begins), shape).tocsc()
+    seen = sparse.csr_array((np.ones(len(view), np.bool_), view, begins), shape)
+    together = sparse.triu(seen.T @ seen, format="csr")
     together.sort_indices()
     return _Floor(
-        (_short(view), _short(lens_of_view[view]), samples.radius2[order], values),
-        (_short(begins), _short(cell), _short(by_view), _short(first)),
+        (_short(view), _short(lens), samples.radius2[order], values),
+        (_short(begins), _short(runs_of_cell), _short(of_run)),
+        (_short(cell), _short(by_view.data), _short(by_view.indptr)),
         (_short(together.indptr), _short(together.indices)),
         lens_of_view,
     )
@@ -187,7 +194,7 @@ def _fill_distances(
     floor: _Floor, weight: Floats, found: tuple[Floats, Floats], distance: Floats
 ) -> None:
     """Fill how far samples lie off their cells' means, with these gains and falloffs."""
-    begins = floor.places[0]
+    begins = floor.begins[0]
 
     def fill(cells: slice) -> None:
         distances(floor.seen, begins[cells.start : cells.stop + 1], weight, *found, distance)
@@ -236,43 +243,44 @@ class _Normal(NamedTuple):
 
 def _normal_equations(floor: _Floor, weight: Floats) -> _Normal:
     """Return them, each cell's own colour eliminated."""
-    begins, num_views = floor.places[0], len(floor.lens_of_view)
-    num_cells, columns = len(begins) - 1, POWERS * (int(floor.lens_of_view.max()) + 1)
+    (of_cell, runs_of_cell, of_run), num_views = floor.begins, len(floor.lens_of_view)
+    num_cells, columns = len(of_cell) - 1, POWERS * (int(floor.lens_of_view.max()) + 1)
     whole, mean = np.empty(num_cells), np.empty((num_cells, CHANNELS))
+    sums = np.empty((len(of_run) - 1, POWERS))
     of_falloff, right_of_falloff = (np.zeros((PARTS, columns, n)) for n in (columns, CHANNELS))
     ends = [num_cells * k // PARTS for k in range(PARTS + 1)]
 
     def add(parts: slice) -> None:
         for k in range(parts.start, parts.stop):
-            some = slice(ends[k], ends[k + 1])
-            rows, cells = (of_falloff[k], right_of_falloff[k]), (whole[some], mean[some])
-            cell_sums(floor.seen, begins[some.start : some.stop + 1], weight, cells, rows)
+            some, ended = slice(ends[k], ends[k + 1]), slice(ends[k], ends[k + 1] + 1)
+            begins, cells = (of_cell[ended], runs_of_cell[ended], of_run), (whole[some], mean[some])
+            cell_sums(floor.seen, begins, weight, cells, sums, (of_falloff[k], right_of_falloff[k]))
 
     between, both = np.empty(len(floor.pattern[1])), np.zeros((num_views, columns))
     right = np.zeros((num_views, CHANNELS))
 
     def fill(views: slice) -> None:
-        weighted, rows = (weight, whole, mean), (between, both, right)
-        view_rows(
-            floor.seen, floor.places, weighted, floor.pattern, rows, (views.start, views.stop)
-        )
+        weighted, rows = (weight, whole, mean, sums), (between, both, right)
+        some = views.start, views.stop
+        view_rows(floor.seen, floor.places, floor.begins, weighted, floor.pattern, rows, some)
 
     side_by_side(add, PARTS, least_items=PARTS)
     side_by_side(fill, num_views)
     starts, others = floor.pattern
-    of_gain = sparse.csr_array((between, others, starts), shape=(num_views, num_views))
+    upper = sparse.csr_array((between, others, starts), shape=(num_views, num_views))
+    of_gain = upper + sparse.triu(upper, 1).T
     return _Normal(of_gain, both, right, of_falloff.sum(axis=0), right_of_falloff.sum(axis=0))
 
 
 def _noise(floor: _Floor, point: Floats, gain: Floats, falloff: Floats) -> float:
     """Standard deviation of one view of a cell: from differences between two views of it."""
-    view, lens, radius2, _ = floor.seen
-    c1, c2, c3 = falloff.T[:, lens]
-    fall = radius2 * (c1 + radius2 * (c2 + radius2 * c3))
-    even = point * np.exp(-fall)[:, None] * np.exp(-gain)[view]
-    difference = np.abs(np.diff(even, axis=0))
-    # From the last view of a cell to the first of the next.
-    across = floor.places[0][1:-1].astype(np.intp) - 1
-    difference = np.delete(difference, across, axis=0)
+    begins = floor.begins[0]
+    difference = np.empty((len(point) - len(begins) + 1, CHANNELS))
+
+    def fill(cells: slice) -> None:
+        some = cells.start, begins[cells.start : cells.stop + 1]
+        differences(floor.seen, some, point, np.exp(-gain), falloff, difference)
+
+    side_by_side(fill, len(begins) - 1)
     sigma = MAD_TO_SIGMA * float(middle(difference.ravel())) / np.sqrt(2.0)
     return max(float(sigma), SMALLEST_NOISE_LEVELS)

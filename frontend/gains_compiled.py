@@ -13,80 +13,79 @@ CHANNELS = 3
 @compiled
 def cell_sums(
     seen: tuple[Any, Any, Any, Any],
-    begins: Any,  # noqa: ANN401 - arrays, typed when compiled
-    weight: Any,  # noqa: ANN401
+    begins: tuple[Any, Any, Any],
+    weight: Any,  # noqa: ANN401 - arrays, typed when compiled
     cells: tuple[Any, Any],
+    sums: Any,  # noqa: ANN401
     lenses: tuple[Any, Any],
 ) -> None:
     """Fill cells' sums of weights and weighted mean values, and add to the rows of the lenses.
 
     Args:
-        seen: see `view_rows`.
-        begins: (cells + 1,) first sample of each cell, and one past the last.
+        seen: samples in order of their cells, and of the views in a cell: views (n,), lenses (n,),
+            r^2 (n,), values (n, 3).
+        begins: (cells + 1,) first sample of each cell; (cells + 1,) its first run of samples of
+            one lens; (runs + 1,) first sample of each; and the number of all.
         weight: (n,) of the samples.
         cells: (cells,) sums of weights and (cells, 3) means, to fill.
+        sums: (runs, POWERS) of the weighted powers of r^2, to fill.
         lenses: (columns, columns) and right side (columns, 3), to add to.
     """
     _, lens, radius2, values = seen
+    of_cell, runs_of_cell, of_run = begins
     whole, mean = cells
     normal, right = lenses
-    total, present = np.zeros(len(normal)), np.empty(len(normal), np.int64)
     for cell in range(len(whole)):
-        first, stop = begins[cell], begins[cell + 1]
         w, blue, green, red = 0.0, 0.0, 0.0, 0.0
-        for k in range(first, stop):
+        for k in range(of_cell[cell], of_cell[cell + 1]):
             w += weight[k]
             blue += weight[k] * values[k, 0]
             green += weight[k] * values[k, 1]
             red += weight[k] * values[k, 2]
         blue, green, red = blue / w, green / w, red / w
         whole[cell], mean[cell, 0], mean[cell, 1], mean[cell, 2] = w, blue, green, red
-        number = 0
-        for k in range(first, stop):
-            at, power = POWERS * lens[k], weight[k]
-            if total[at] == 0.0:
-                present[number] = at
-                number += 1
-            rest = values[k, 0] - blue, values[k, 1] - green, values[k, 2] - red
-            for i in range(POWERS):
-                power *= radius2[k]
-                total[at + i] += power
-                both = power
-                for j in range(POWERS):
-                    both *= radius2[k]
-                    normal[at + i, at + j] += both
-                for channel in range(CHANNELS):
-                    right[at + i, channel] += power * rest[channel]
-        _take_total(total, present[:number], w, normal)
+        first, stop = runs_of_cell[cell], runs_of_cell[cell + 1]
+        for run in range(first, stop):
+            at = POWERS * lens[of_run[run]]
+            sums[run, 0], sums[run, 1], sums[run, 2] = 0.0, 0.0, 0.0
+            for k in range(of_run[run], of_run[run + 1]):
+                rest = values[k, 0] - blue, values[k, 1] - green, values[k, 2] - red
+                _add_sample(weight[k], radius2[k], rest, sums[run], normal[at:, at:], right[at:])
+        for one in range(first, stop):
+            for other in range(first, stop):
+                rows, columns = POWERS * lens[of_run[one]], POWERS * lens[of_run[other]]
+                for i in range(POWERS):
+                    for j in range(POWERS):
+                        normal[rows + i, columns + j] -= sums[one, i] * sums[other, j] / w
 
 
 @part
-def _take_total(total: Any, present: Any, whole: float, normal: Any) -> None:  # noqa: ANN401
-    """Subtract s s' / W of one cell, as far as it is of lenses, and empty s."""
-    for one in present:
-        for i in range(POWERS):
-            share = total[one + i] / whole
-            for other in present:
-                for j in range(POWERS):
-                    normal[one + i, other + j] -= share * total[other + j]
-    for one in present:
-        total[one : one + POWERS] = 0.0
-
-
-@part
-def _add(falloff: Any, lens: int, powers: tuple[float, float, float]) -> None:  # noqa: ANN401
-    """Add to the columns of one lens."""
-    at = POWERS * lens
-    falloff[at] += powers[0]
-    falloff[at + 1] += powers[1]
-    falloff[at + 2] += powers[2]
+def _add_sample(
+    power: float,
+    radius2: float,
+    rest: tuple[float, float, float],
+    sums: Any,  # noqa: ANN401
+    normal: Any,  # noqa: ANN401
+    right: Any,  # noqa: ANN401
+) -> None:
+    """Add a sample's powers of r^2, `power` being its weight, and their products."""
+    for i in range(POWERS):
+        power *= radius2
+        sums[i] += power
+        both = power
+        for j in range(POWERS):
+            both *= radius2
+            normal[i, j] += both
+        for channel in range(CHANNELS):
+            right[i, channel] += power * rest[channel]
 
 
 @compiled
 def view_rows(
     seen: tuple[Any, Any, Any, Any],
-    places: tuple[Any, Any, Any, Any],
-    weighted: tuple[Any, Any, Any],
+    places: tuple[Any, Any, Any],
+    begins: tuple[Any, Any, Any],
+    weighted: tuple[Any, Any, Any, Any],
     pattern: tuple[Any, Any],
     rows: tuple[Any, Any, Any],
     views: tuple[int, int],
@@ -95,49 +94,49 @@ def view_rows(
 
     With a row a of the design for each of a cell's samples, their weights w of sum W, and s the
     sum of w a, the cell adds the sum of w a a' less s s' / W. The design has a column for each
-    view, and then one for each power of r^2 of each lens.
+    view, and then one for each power of r^2 of each lens. Of the views' columns those from each
+    view itself on are filled.
 
     Args:
-        seen: samples in order of their cells: views (n,), lenses (n,), r^2 (n,), values (n, 3).
-        places: (cells + 1,) first sample of each cell, and the number of samples; (n,) cells;
-            (n,) samples in order of their views; (views + 1,) first place of each view in that.
-        weighted: (n,) weights, and what `cell_sums` fills of cells.
-        pattern: compressed rows of the views that share a cell with each, itself among them:
-            (views + 1,) and (m,).
+        seen: see `cell_sums`.
+        places: (n,) cells of the samples; (n,) samples in order of their views; (views + 1,) first
+            place of each view in that.
+        begins: see `cell_sums`.
+        weighted: (n,) weights, and what `cell_sums` fills of cells and runs.
+        pattern: compressed rows of the views from each on that share a cell with it, itself among
+            them: (views + 1,) and (m,).
         rows: to fill: (m,) views' columns; (views, columns) falloffs' columns and (views, 3) right
             side, which hold zeros.
         views: the first, and one past the last.
     """
     view, lens, radius2, values = seen
-    begins, cell_of, order, begins_of_view = places
-    weight, whole, mean = weighted
+    cell_of, order, begins_of_view = places
+    of_cell, runs_of_cell, of_run = begins
+    weight, whole, mean, sums = weighted
     starts, others = pattern
     between, falloff, right = rows
-    row, fall = np.zeros(len(right)), np.zeros(falloff.shape[1])
+    row = np.zeros(len(right))
     for number in range(views[0], views[1]):
         blue, green, red = 0.0, 0.0, 0.0
         for place in range(begins_of_view[number], begins_of_view[number + 1]):
             k = order[place]
-            cell, w, r2 = cell_of[k], weight[k], radius2[k]
+            cell, w = cell_of[k], weight[k]
             row[number] += w
             blue += w * (values[k, 0] - mean[cell, 0])
             green += w * (values[k, 1] - mean[cell, 1])
             red += w * (values[k, 2] - mean[cell, 2])
-            _add(fall, lens[k], (w * r2, w * r2 * r2, w * r2 * r2 * r2))
-            share, same = w / whole[cell], lens[begins[cell]]
-            c1, c2, c3 = 0.0, 0.0, 0.0  # a row's sums wait for each other, these do not
-            for other in range(begins[cell], begins[cell + 1]):
-                if lens[other] != same:
-                    _add(fall, same, (c1, c2, c3))
-                    same, c1, c2, c3 = lens[other], 0.0, 0.0, 0.0
-                w, r2 = share * weight[other], radius2[other]
-                row[view[other]] -= w
-                w *= r2
-                c1, w = c1 - w, w * r2
-                c2, c3 = c2 - w, c3 - w * r2
-            _add(fall, same, (c1, c2, c3))
+            share = w / whole[cell]
+            for run in range(runs_of_cell[cell], runs_of_cell[cell + 1]):
+                at = POWERS * lens[of_run[run]]
+                for i in range(POWERS):
+                    falloff[number, at + i] -= share * sums[run, i]
+            at = POWERS * lens[k]
+            for i in range(POWERS):
+                w *= radius2[k]
+                falloff[number, at + i] += w
+            for other in range(k, of_cell[cell + 1]):
+                row[view[other]] -= share * weight[other]
         right[number, 0], right[number, 1], right[number, 2] = blue, green, red
-        falloff[number], fall[:] = fall, 0.0
         for place in range(starts[number], starts[number + 1]):
             between[place] = row[others[place]]
             row[others[place]] = 0.0
@@ -173,9 +172,9 @@ def distances(
     """Fill how far samples lie off their cells' weighted means, root mean square of the channels.
 
     Args:
-        seen: see `view_rows`.
-        begins: see `cell_sums`.
-        weight: see `cell_sums`.
+        seen: see `cell_sums`.
+        begins: (cells + 1,) first sample of each cell, and the number of samples.
+        weight: (n,) of the samples.
         gain: (views, 3).
         falloff: (lenses, POWERS).
         found: (n,) to fill.
@@ -191,3 +190,42 @@ def distances(
             b, g, r = _even(seen, k, gain, falloff)
             b, g, r = b - blue, g - green, r - red
             found[k] = np.sqrt((b * b + g * g + r * r) / CHANNELS)
+
+
+@compiled
+def differences(
+    seen: tuple[Any, Any, Any, Any],
+    begins: tuple[int, Any],
+    point: Any,  # noqa: ANN401 - arrays, typed when compiled
+    factor: Any,  # noqa: ANN401
+    falloff: Any,  # noqa: ANN401
+    found: Any,  # noqa: ANN401
+) -> None:
+    """Fill how far each cell's views are off those before them, as evenly exposed values.
+
+    Args:
+        seen: see `cell_sums`.
+        begins: number of the first of these cells; (cells + 1,) first sample of each of them, and
+            one past the last.
+        point: (n, 3) values at the cells' centres.
+        factor: (views, 3) of each view, that takes its gain out.
+        falloff: (lenses, POWERS).
+        found: (n - all cells, 3) to fill: a cell's first view has none before it.
+    """
+    view, lens, radius2, _ = seen
+    first, of_cell = begins
+    for cell in range(len(of_cell) - 1):
+        blue, green, red = 0.0, 0.0, 0.0
+        for k in range(of_cell[cell], of_cell[cell + 1]):
+            a, b, r2 = view[k], lens[k], radius2[k]
+            dark = np.exp(-r2 * (falloff[b, 0] + r2 * (falloff[b, 1] + r2 * falloff[b, 2])))
+            to_blue, to_green, to_red = point[k, 0], point[k, 1], point[k, 2]
+            to_blue *= dark * factor[a, 0]
+            to_green *= dark * factor[a, 1]
+            to_red *= dark * factor[a, 2]
+            if k > of_cell[cell]:
+                at = np.int64(k) - first - cell - 1
+                found[at, 0] = abs(to_blue - blue)
+                found[at, 1] = abs(to_green - green)
+                found[at, 2] = abs(to_red - red)
+            blue, green, red = to_blue, to_green, to_red

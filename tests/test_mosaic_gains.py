@@ -13,7 +13,7 @@ from groundfuse.frontend.gains import (
     neutral_exposure,
     radius_squared,
 )
-from groundfuse.frontend.gains_compiled import distances
+from groundfuse.frontend.gains_compiled import differences, distances
 from groundfuse.frontend.mosaic import MosaicOptions, build_mosaic
 
 # Samples are good to 2 % each, some 300 per view; 20 % of them are of obstacles.
@@ -139,6 +139,25 @@ def test_noise_is_that_of_one_view():
     samples = Samples(samples.cell, samples.view, samples.radius2, samples.colour, point)
     found = estimate_exposure(samples, np.arange(VIEWS) % 2)
     assert 5.5 < found.noise_levels < 6.5
+
+
+def test_differences_are_between_evenly_exposed_views_of_a_cell():
+    """All of them in one go, and the last two cells' in a go of their own."""
+    rng = np.random.default_rng(6)
+    begins = np.array([0, 3, 5, 9], np.uint32)
+    view, lens = rng.integers(0, 4, 9).astype(np.uint32), rng.integers(0, 2, 9).astype(np.uint32)
+    radius2, point = rng.random(9), rng.uniform(10.0, 200.0, (9, 3))
+    gain, falloff = rng.normal(0, 0.2, (4, 3)), rng.normal(0, 0.2, (2, 3))
+    powers = radius2[:, None] ** np.array([1, 2, 3])
+    even = point / np.exp(gain[view] + (powers * falloff[lens]).sum(axis=1)[:, None])
+    expected = np.abs(np.vstack([np.diff(part, axis=0) for part in np.split(even, [3, 5])]))
+    seen = view, lens, radius2, np.zeros((9, 3))
+    for first in (0, 1):
+        found = np.full((6, 3), -1.0)
+        differences(seen, (first, begins[first:]), point, np.exp(-gain), falloff, found)
+        untouched = 2 * first
+        assert (found[:untouched] == -1.0).all()
+        np.testing.assert_allclose(found[untouched:], expected[untouched:], rtol=1e-12)
 
 
 def test_views_that_share_nothing_stay_as_they_are():
