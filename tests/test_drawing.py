@@ -19,8 +19,8 @@ from groundfuse.tools.drawing_graph import (
     ELLIPSE_MARKERS,
     NUM_SIGMAS,
     Placing,
-    draw_cone,
-    draw_ellipse,
+    draw_cones,
+    draw_ellipses,
     exaggeration,
     marker_px,
 )
@@ -214,7 +214,9 @@ def test_ellipse_is_as_large_as_its_covariance(size):
     canvas = Canvas(200, 200, WHITE)
     axis, angle = size * np.array([60.0, 20.0]), 0.5
     turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-    draw_ellipse(canvas, np.array([100.0, 100.0]), turn @ np.diag(axis**2) @ turn.T, (0, 0, 0))
+    draw_ellipses(
+        canvas, np.array([[100.0, 100.0]]), (turn @ np.diag(axis**2) @ turn.T)[None], (0, 0, 0)
+    )
     drawn = np.argwhere((canvas.finished() < 250).any(axis=2)) - 100.0
     along = drawn @ np.array([-math.sin(angle), math.cos(angle)])  # rows count downwards
     across = drawn @ np.array([math.cos(angle), math.sin(angle)])
@@ -225,7 +227,7 @@ def test_ellipse_is_as_large_as_its_covariance(size):
 @pytest.mark.parametrize(("heading_rad", "way"), [(0.0, (1, 0)), (math.pi / 2, (0, -1))])
 def test_cone_opens_along_the_heading(heading_rad, way):
     canvas = Canvas(100, 100, WHITE)
-    draw_cone(canvas, np.array([50.0, 50.0]), heading_rad, 30.0, (0, 0, 0))
+    draw_cones(canvas, np.array([[50.0, 50.0]]), np.array([heading_rad]), 30.0, (0, 0, 0))
     ahead = centroid(canvas.finished(), WHITE) - 50.0
     # The centre of a sector's area lies at about two thirds of its radius.
     assert np.abs(ahead - 20.0 * np.array(way)).max() < 3.0

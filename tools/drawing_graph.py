@@ -1,5 +1,6 @@
 """The location graph as lines on a canvas: trajectories, edges, headings, ellipses, numbers."""
 
+import functools
 import math
 from dataclasses import dataclass
 from itertools import pairwise
@@ -60,17 +61,25 @@ class Placing:
 def draw_graph(canvas: Canvas, graph: Graph, placing: Placing) -> None:
     """Draw edges, ellipses, trajectories, headings and numbers, the important last."""
     at = dict(zip(graph.poses, placing.px(graph.places()), strict=True))
-    colour = {frame: _colour(graph, frame) for frame in graph.poses}
+    colours = {robot: robot_colour(number) for number, robot in enumerate(graph.robots)}
     for kind in EdgeKind:
-        for a, b in graph.edges[kind]:
-            draw_edge(canvas, np.array([at[a], at[b]]), kind, colour[a])
+        for robot, colour in colours.items():
+            ends = [(at[a], at[b]) for a, b in graph.edges[kind] if a.robot == robot]
+            draw_edges(canvas, np.array(ends).reshape(-1, 2, 2), kind, colour)
     _draw_gaps(canvas, graph, placing)
     radius = marker_px(graph, placing.px_per_m)
-    for frame in graph.poses:
-        _draw_heading(canvas, graph, placing, frame, radius)
     scale = (NUM_SIGMAS * exaggeration(graph, placing.px_per_m) * placing.px_per_m) ** 2
-    for frame, covariance in graph.covariance.items():
-        draw_ellipse(canvas, at[frame], covariance * scale, colour[frame])
+    for robot, colour in colours.items():
+        track = graph.track(robot)
+        mounted = graph.base_from_foot.get(robot, IDENTITY)
+        feet = np.array([(graph.poses[frame] @ mounted).vector() for frame in track])
+        feet = feet.reshape(-1, 3)
+        draw_cones(canvas, placing.px(feet[:, :2]), feet[:, 2], 3.0 * radius, colour)
+    for robot, colour in colours.items():
+        known = [frame for frame in graph.track(robot) if frame in graph.covariance]
+        spread = np.array([graph.covariance[frame] for frame in known]).reshape(-1, 2, 2)
+        places = np.array([at[frame] for frame in known]).reshape(-1, 2)
+        draw_ellipses(canvas, places, spread * scale, colour)
     if radius < NUMBERED_FROM_PX:
         _draw_dots(canvas, graph, placing, radius)
     else:
@@ -94,16 +103,17 @@ def exaggeration(graph: Graph, px_per_m: float) -> float:
     return round_below(wanted_m / radius_m) if wanted_m > radius_m > 0.0 else 1.0
 
 
-def draw_edge(canvas: Canvas, ends: Floats, kind: EdgeKind, colour: Colour) -> None:
-    """Draw one edge from point to point (2, 2) in the style of its kind."""
+def draw_edges(canvas: Canvas, ends: Floats, kind: EdgeKind, colour: Colour) -> None:
+    """Draw edges from point to point (n, 2, 2) in the style of their kind."""
     if kind is EdgeKind.NEIGHBOUR:
-        canvas.line(ends, colour, 3.5, casing=WHITE)
+        canvas.lines(ends, colour, 3.5, casing=WHITE)
     elif kind is EdgeKind.LOOP:
-        canvas.line(ends, mixed(colour, WHITE, 0.35), 1.5, casing=mixed(colour, INK, 0.5))
+        canvas.lines(ends, mixed(colour, WHITE, 0.35), 1.5, casing=mixed(colour, INK, 0.5))
     elif kind is EdgeKind.OVERLAP:
-        canvas.line(ends, OVERLAP, 1.0, casing=INK)
+        canvas.lines(ends, OVERLAP, 1.0, casing=INK)
     else:
-        canvas.dashes(ends, REJECTED, 1.0, 3.0, 6.0)
+        for way in ends:
+            canvas.dashes(way, REJECTED, 1.0, 3.0, 6.0)
 
 
 def draw_marker(canvas: Canvas, centre: Floats, radius_px: float, colour: Colour) -> None:
@@ -111,28 +121,37 @@ def draw_marker(canvas: Canvas, centre: Floats, radius_px: float, colour: Colour
     canvas.disc(centre, radius_px, colour, casing=WHITE)
 
 
-def draw_cone(
-    canvas: Canvas, foot: Floats, heading_rad: float, length_px: float, colour: Colour
+def draw_cones(
+    canvas: Canvas, feet: Floats, headings_rad: Floats, length_px: float, colour: Colour
 ) -> None:
-    """Draw where a camera looks: a cone that opens along its heading (x right, y up)."""
-    angles = heading_rad + np.linspace(-0.42, 0.42, 5)
-    arc = foot + length_px * np.column_stack([np.cos(angles), -np.sin(angles)])
-    outline = np.vstack([foot, arc])
-    canvas.polygon(outline, mixed(colour, WHITE, 0.25), opacity=0.55)
-    canvas.line(outline, WHITE, 1.0, closed=True)
+    """Draw where cameras look: cones from (n, 2) that open along (n,) headings (x right, y up)."""
+    angles = headings_rad[:, None] + np.linspace(-0.42, 0.42, 5)
+    arcs = feet[:, None] + length_px * np.stack([np.cos(angles), -np.sin(angles)], axis=-1)
+    outlines = np.concatenate([feet[:, None], arcs], axis=1)
+    for outline in outlines:
+        canvas.polygon(outline, mixed(colour, WHITE, 0.25), opacity=0.55)
+    canvas.lines(outlines, WHITE, 1.0, closed=True)
 
 
-def draw_ellipse(canvas: Canvas, centre: Floats, covariance_px: Floats, colour: Colour) -> None:
-    """Draw the outline where x' C^-1 x = 1 around a point, y up."""
-    values, axes = np.linalg.eigh(covariance_px)
+def draw_ellipses(canvas: Canvas, centres: Floats, covariances_px: Floats, colour: Colour) -> None:
+    """Draw the outlines where x' C^-1 x = 1 around points (n, 2), y up; C is (n, 2, 2)."""
+    values, axes = np.linalg.eigh(covariances_px)
     radii = np.sqrt(np.maximum(values, 0.0))
-    # A chord of n in a circle is off it by r (1 - cos(pi / n)), about r pi^2 / (2 n^2).
-    corners = math.ceil(math.pi * math.sqrt(float(radii.max()) / (2.0 * CHORD_PX)))
-    turn = np.arange(max(corners, FEWEST_CORNERS)) * (2.0 * math.pi / max(corners, FEWEST_CORNERS))
-    round_ = np.column_stack([np.cos(turn), np.sin(turn)]) * radii
-    outline = centre + (round_ @ axes.T) * (1.0, -1.0)
-    canvas.polygon(outline, colour, opacity=0.22)
-    canvas.line(outline, mixed(colour, INK, 0.25), 1.5, closed=True, casing=WHITE)
+    outlines = []
+    for centre, radius, axis in zip(centres, radii, axes, strict=True):
+        # A chord of n in a circle is off it by r (1 - cos(pi / n)), about r pi^2 / (2 n^2).
+        sides = math.ceil(math.pi * math.sqrt(float(radius.max()) / (2.0 * CHORD_PX)))
+        round_ = _circle(max(sides, FEWEST_CORNERS)) * radius
+        outlines.append(centre + (round_ @ axis.T) * (1.0, -1.0))
+        canvas.polygon(outlines[-1], colour, opacity=0.22)
+    canvas.lines(outlines, mixed(colour, INK, 0.25), 1.5, closed=True, casing=WHITE)
+
+
+@functools.lru_cache(maxsize=1024)
+def _circle(corners: int) -> Floats:
+    """Return so many points (n, 2) of the unit circle."""
+    turn = np.arange(corners) * (2.0 * math.pi / corners)
+    return np.column_stack([np.cos(turn), np.sin(turn)])
 
 
 def _colour(graph: Graph, frame: FrameId) -> Colour:
@@ -148,14 +167,6 @@ def _draw_gaps(canvas: Canvas, graph: Graph, placing: Placing) -> None:
             if frozenset((a, b)) not in joined:
                 ends = np.array([placing.of(graph.poses[a]), placing.of(graph.poses[b])])
                 canvas.dashes(ends, _colour(graph, a), 2.0, 2.0, 6.0, casing=WHITE)
-
-
-def _draw_heading(
-    canvas: Canvas, graph: Graph, placing: Placing, frame: FrameId, radius_px: float
-) -> None:
-    foot = graph.poses[frame] @ graph.base_from_foot.get(frame.robot, IDENTITY)
-    colour = _colour(graph, frame)
-    draw_cone(canvas, placing.of(foot), foot.theta_rad, 3.0 * radius_px, colour)
 
 
 def _draw_numbers(canvas: Canvas, graph: Graph, placing: Placing, radius_px: float) -> None:

@@ -12,9 +12,9 @@ from groundfuse.tools.canvas import Canvas, Colour, text_width_px
 from groundfuse.tools.drawing_component import EdgeKind, Graph
 from groundfuse.tools.drawing_graph import (
     NUM_SIGMAS,
-    draw_cone,
-    draw_edge,
-    draw_ellipse,
+    draw_cones,
+    draw_edges,
+    draw_ellipses,
     draw_marker,
 )
 from groundfuse.tools.drawing_style import FAINT, GRID, INK, length_text, robot_colour
@@ -125,16 +125,17 @@ def _draw_edge_sample(pen: _Pen, kind: EdgeKind, words: str) -> None:
     ends = np.array([[pen.left_px, pen.y_px], [pen.left_px + SAMPLE_PX - 10.0, pen.y_px]])
     if kind is EdgeKind.REJECTED:
         pen.canvas.line(ends, FAINT, 9.0)  # floor enough to see its light dashes on
-    draw_edge(pen.canvas, ends, kind, robot_colour(0))
+    draw_edges(pen.canvas, ends[None], kind, robot_colour(0))
     pen.say(words, indent_px=SAMPLE_PX)
 
 
 def _draw_symbols(pen: _Pen, graph: Graph, larger: float) -> None:
     middle = pen.left_px + (SAMPLE_PX - 10.0) / 2.0
-    draw_cone(pen.canvas, np.array([middle - 9.0, pen.y_px]), 0.0, 20.0, robot_colour(0))
+    foot = np.array([[middle - 9.0, pen.y_px]])
+    draw_cones(pen.canvas, foot, np.zeros(1), 20.0, robot_colour(0))
     pen.say("camera heading", indent_px=SAMPLE_PX)
     if graph.covariance:
         spread = np.diag([11.0**2, 6.0**2])
-        draw_ellipse(pen.canvas, np.array([middle, pen.y_px]), spread, robot_colour(0))
+        draw_ellipses(pen.canvas, np.array([[middle, pen.y_px]]), spread[None], robot_colour(0))
         scale = "" if larger == 1.0 else f", enlarged {larger:g} times"
         pen.say(f"{NUM_SIGMAS:g}-sigma ellipse{scale}", indent_px=SAMPLE_PX)

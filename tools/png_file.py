@@ -6,7 +6,6 @@ and ISA-L deflates it, band by band, as what is not in the processor's cache tak
 """
 
 import struct
-import zlib
 from pathlib import Path
 
 import cv2
@@ -65,4 +64,9 @@ def _differences(band: Image) -> Image:
 
 def _chunk(kind: bytes, data: bytes) -> bytes:
     """Return a piece of the file, which says its length and its check sum."""
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+    return (
+        struct.pack(">I", len(data))
+        + kind
+        + data
+        + struct.pack(">I", isal_zlib.crc32(data, isal_zlib.crc32(kind)))
+    )
