@@ -64,9 +64,5 @@ def _differences(band: Image) -> Image:
 
 def _chunk(kind: bytes, data: bytes) -> bytes:
     """Return a piece of the file, which says its length and its check sum."""
-    return (
-        struct.pack(">I", len(data))
-        + kind
-        + data
-        + struct.pack(">I", isal_zlib.crc32(data, isal_zlib.crc32(kind)))
-    )
+    check = isal_zlib.crc32(data, isal_zlib.crc32(kind))
+    return b"".join([struct.pack(">I", len(data)), kind, data, struct.pack(">I", check)])
