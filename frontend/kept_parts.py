@@ -1,18 +1,24 @@
 """Tiles and samples of earlier mosaics, each with what it was made from.
 
-Whether a part is kept depends on its own record and on today's plan alone, and a part that is not
-kept is made from today's plan alone. So it does not matter whether some parts were renewed already
-by a run of the same plan that was interrupted: those are today's, and the others are kept or not
-as they would have been.
+What is kept of a part depends on its own record and on today's plan alone, and what is not kept is
+made from today's plan alone. So it does not matter whether some parts were renewed already by a run
+of the same plan that was interrupted: those are today's, and the others are kept or not as they
+would have been.
+
+A tile whose views all stay, but that a new view shows some of, is patched: rendered are the cells
+around what that view shows, and no cell depends on another. Its record goes on saying how the rest
+was rendered, from which the patch may differ by half of what is allowed; so may today's from then
+on.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
+from itertools import compress
+from typing import Any, Protocol
 
 import numpy as np
 
-from groundfuse.frontend.arrays import Floats
+from groundfuse.frontend.arrays import Floats, Mask
 from groundfuse.frontend.exposure_samples import ViewSamples
 from groundfuse.frontend.gains import Exposure, neutral_exposure
 from groundfuse.frontend.made_from import (
@@ -20,12 +26,19 @@ from groundfuse.frontend.made_from import (
     every_view,
     is_same,
     made_from,
+    new_views,
+    only,
+    patched,
     same_views,
     stacked,
 )
 from groundfuse.frontend.mosaic_options import MosaicOptions
 from groundfuse.frontend.mosaic_plan import Block, Extent, MosaicPlan
 from groundfuse.frontend.mosaic_tile import Tile
+
+PATCHED_SHARE = 0.5
+"""Of what may change, for a tile that is patched or was: patch and rest may each be that far off
+its record, so they are off each other and off today by no more than what may change."""
 
 
 class Memory(Protocol):
@@ -47,10 +60,16 @@ class KeptTile:
     """A finished tile, None where no view saw any of it, and what it was made from.
 
     The tile is not deflated: a third of the room is not worth a sixth of the time of a rendering.
+
+    Attributes:
+        made_from: see there.
+        tile: the layers.
+        patched: whether some of it was rendered later than its record says.
     """
 
     made_from: MadeFrom
     tile: Tile | None
+    patched: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,34 +135,54 @@ class Keeper:
         block: Block,
         shown: Sequence[Extent],
         exposure: Exposure,
-        work: Callable[[], Tile | None],
+        work: Callable[[Block], Tile | None],
     ) -> Tile | None:
-        """Return one tile, made now if need be.
+        """Return one tile, made now if need be, or as much of it as need be.
 
         Args:
             block: its place in the grid.
             shown: the views' parts of it.
             exposure: of all views.
-            work: makes it.
+            work: makes it, or a block of it.
         """
         if self._memory is None:
-            return work()
+            return work(block)
         (row, column), grid = self._plan.grid.first_cells, self._plan.grid
         side, options = self._options.tile_cells, self._options
         at = row + block[0].start, column + block[1].start
         settings = "tile", grid.m_per_px, at, side, options.max_depth, options.num_sigmas
         today = made_from(self._every, [extent.view for extent in shown], exposure, settings)
         name = f"tile {at[0] // side} {at[1] // side}"
-        parts = [extent.within(*block) or block for extent in shown]
         kept = self._memory.load(name)
-        limits = grid.m_per_px, options
-        if isinstance(kept, KeptTile) and is_same(
-            kept.made_from, today, self._corners_m(parts), *limits
-        ):
-            return kept.tile
-        found = work()
+        if isinstance(kept, KeptTile):
+            parts = [extent.within(*block) or block for extent in shown]
+            new = self._new(kept, today, parts)
+            if new is not None and not new.any():
+                return kept.tile
+            if new is not None and (box := _around(compress(parts, new))) != block:
+                tile = _pasted(kept.tile, block, work(box), box)
+                now = patched(kept.made_from, today, new)
+                self._memory.save(name, KeptTile(now, tile, patched=True))
+                return tile
+        found = work(block)
         self._memory.save(name, KeptTile(today, found))
         return found
+
+    def _new(self, kept: KeptTile, today: MadeFrom, parts: Sequence[Block]) -> Mask | None:
+        """Tell which of a tile's views are new (n,); None where others may not stay as they are."""
+        new = new_views(kept.made_from, today)
+        if new is None:
+            return None
+        options, cell_m = self._options, self._plan.grid.m_per_px
+        if kept.patched or new.any():
+            options = replace(
+                options,
+                keep_within_cells=PATCHED_SHARE * options.keep_within_cells,
+                keep_within_levels=PATCHED_SHARE * options.keep_within_levels,
+            )
+        corners_m = self._corners_m(list(compress(parts, ~new)))
+        stays = is_same(kept.made_from, only(today, ~new), corners_m, cell_m, options)
+        return new if stays else None
 
     def _corners_m(self, parts: Sequence[Block]) -> Floats:
         """Return the corners (n, 4, 2) of blocks of cells."""
@@ -154,3 +193,31 @@ class Keeper:
         y = grid.y_max_m - rows * grid.m_per_px
         corners: Floats = np.stack([x[:, [0, 1, 0, 1]], y[:, [0, 0, 1, 1]]], axis=-1)
         return corners
+
+
+def _around(parts: Iterable[Block]) -> Block:
+    """Return the smallest block that holds all parts."""
+    rows, columns = zip(*parts, strict=True)
+    return (
+        slice(min(r.start for r in rows), max(r.stop for r in rows)),
+        slice(min(c.start for c in columns), max(c.stop for c in columns)),
+    )
+
+
+def _pasted(tile: Tile | None, block: Block, patch: Tile | None, box: Block) -> Tile | None:
+    """Return a tile of a block with another's cells in a box of it."""
+    if patch is None:
+        return tile
+    shape = block[0].stop - block[0].start, block[1].stop - block[1].start
+    (row, column), (rows, columns) = (block[0].start, block[1].start), patch.count.shape
+    first = box[0].start - row, box[1].start - column
+    cells = slice(first[0], first[0] + rows), slice(first[1], first[1] + columns)
+    layers = []
+    for name in ("floor", "mean", "count"):
+        new: np.ndarray[Any, Any] = getattr(patch, name)
+        whole = np.zeros((*shape, *new.shape[2:]), new.dtype)
+        if tile is not None:
+            whole[:] = getattr(tile, name)
+        whole[cells] = new
+        layers.append(whole)
+    return Tile(*layers)

@@ -6,7 +6,8 @@ compared is always what a part was really rendered with, so small changes can't 
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,6 +114,53 @@ def stacked(records: Sequence[MadeFrom]) -> MadeFrom:
         np.concatenate([record.limit_m for record in records]),
         np.concatenate([record.colour for record in records]),
         records[0].noise_levels,
+    )
+
+
+def new_views(kept: MadeFrom, today: MadeFrom) -> Mask | None:
+    """Tell (n,) which of today's views were not there, or None where some of those are gone."""
+    before = set(kept.who)
+    new = np.array([who not in before for who in today.who], bool)
+    rest = tuple(who for who in today.who if who in before)
+    return new if rest == kept.who else None
+
+
+def only(record: MadeFrom, views: Mask) -> MadeFrom:
+    """Describe a part as if only those (n,) of its views had taken part."""
+    return replace(
+        record,
+        who=tuple(compress(record.who, views)),
+        lens_of_view=record.lens_of_view[views],
+        place=record.place[views],
+        limit_m=record.limit_m[views],
+        colour=record.colour[views],
+    )
+
+
+def patched(kept: MadeFrom, today: MadeFrom, new: Mask) -> MadeFrom:
+    """Describe a part of which only what the new views show was made today.
+
+    Args:
+        kept: what it was made from before.
+        today: with the new views.
+        new: (n,) which of today's views these are.
+    """
+    lenses = [today.lenses[k] for k in today.lens_of_view]
+    place, limit_m, colour = today.place.copy(), today.limit_m.copy(), today.colour.copy()
+    place[~new], limit_m[~new], colour[~new] = kept.place, kept.limit_m, kept.colour
+    for k, lens in zip(np.flatnonzero(~new), kept.lens_of_view, strict=True):
+        lenses[k] = kept.lenses[lens]
+    number = {lens: k for k, lens in enumerate(dict.fromkeys(lenses))}
+    lens_of_view = np.array([number[lens] for lens in lenses])
+    return MadeFrom(
+        today.settings,
+        today.who,
+        tuple(number),
+        lens_of_view,
+        place,
+        limit_m,
+        colour,
+        kept.noise_levels,
     )
 
 

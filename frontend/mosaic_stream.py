@@ -65,7 +65,8 @@ def mosaic_tiles(
     cost nothing. A tile of an earlier mosaic is taken from the memory if it has the same views of
     the same pictures, and none of them, as the tile was rendered with it, would move or change its
     light by more than `keep_within_cells` and `keep_within_levels`; so are the samples that
-    exposures are estimated from. The others are rendered, and kept in their places.
+    exposures are estimated from. Where there are new views besides, the cells around what they show
+    are rendered anew. The others are rendered, and kept in their places.
 
     Raises:
         ValueError: a picture of another size than its camera's; a memory, and no digest of a
@@ -86,7 +87,8 @@ def mosaic_tiles(
         scene = _Scene(plan, pictures, exposure, options, keeper)
 
         def work(item: tuple[Block, list[Extent]]) -> Tile | None:
-            return scene.keeper.tile(*item, exposure, lambda: _tile(scene, *item))
+            block, shown = item
+            return scene.keeper.tile(block, shown, exposure, lambda part: _tile(scene, part, shown))
 
         ahead = AHEAD_PER_WORKER * options.workers
         for (block, _), tile in zip(blocks, in_order(threads, work, blocks, ahead), strict=True):
@@ -162,7 +164,7 @@ def _exposure(
 
 
 def _tile(scene: _Scene, block: Block, shown: list[Extent]) -> Tile | None:
-    """Combine all views of one tile, or return None where no view sees any of it."""
+    """Combine all views of a tile, or of a block of one; None where no view sees any of it."""
     rows, columns = block[0].stop - block[0].start, block[1].stop - block[1].start
     stack = TileStack(rows, columns, min(scene.options.max_depth, len(shown)))
     room = room_for(rows * columns)
