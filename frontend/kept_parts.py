@@ -5,14 +5,12 @@ made from today's plan alone. So it does not matter whether some parts were rene
 of the same plan that was interrupted: those are today's, and the others are kept or not as they
 would have been.
 
-A tile whose views all stay, but that a new view shows some of, is patched: rendered are the cells
-around what that view shows, and no cell depends on another. Its record goes on saying how the rest
-was rendered, from which the patch may differ by half of what is allowed; so may today's from then
-on.
+A tile whose views all stay, but that a new view shows some of, is patched: only the cells around
+what that view shows are rendered, as no cell depends on another. The patch has a record of its own.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import compress
 from typing import Any, Protocol
 
@@ -26,19 +24,17 @@ from groundfuse.frontend.made_from import (
     every_view,
     is_same,
     made_from,
-    new_views,
     only,
-    patched,
     same_views,
     stacked,
+    taking_part,
 )
 from groundfuse.frontend.mosaic_options import MosaicOptions
 from groundfuse.frontend.mosaic_plan import Block, Extent, MosaicPlan
 from groundfuse.frontend.mosaic_tile import Tile
 
-PATCHED_SHARE = 0.5
-"""Of what may change, for a tile that is patched or was: patch and rest may each be that far off
-its record, so they are off each other and off today by no more than what may change."""
+MOST_PATCHES = 8
+"""A tile with more is rendered as a whole again."""
 
 
 class Memory(Protocol):
@@ -56,20 +52,39 @@ class Memory(Protocol):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Patch:
+    """A block of a tile that was rendered later than the rest.
+
+    Attributes:
+        cells: first row, row after the last, and columns alike, from the tile's first.
+        made_from: see there; of the views that show any of the block.
+    """
+
+    cells: tuple[int, int, int, int]
+    made_from: MadeFrom
+
+    def within(self, block: Block) -> Block:
+        """Return its place in the grid, from that of the tile."""
+        top, bottom, left, right = self.cells
+        row, column = block[0].start, block[1].start
+        return slice(row + top, row + bottom), slice(column + left, column + right)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class KeptTile:
     """A finished tile, None where no view saw any of it, and what it was made from.
 
     The tile is not deflated: a third of the room is not worth a sixth of the time of a rendering.
 
     Attributes:
-        made_from: see there.
+        made_from: see there; of all that is in no patch.
         tile: the layers.
-        patched: whether some of it was rendered later than its record says.
+        patches: blocks that new views made it necessary to render again.
     """
 
     made_from: MadeFrom
     tile: Tile | None
-    patched: bool = False
+    patches: tuple[Patch, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,34 +170,36 @@ class Keeper:
         name = f"tile {at[0] // side} {at[1] // side}"
         kept = self._memory.load(name)
         if isinstance(kept, KeptTile):
-            parts = [extent.within(*block) or block for extent in shown]
-            new = self._new(kept, today, parts)
+            new = self._new(kept, today, block, shown)
             if new is not None and not new.any():
                 return kept.tile
-            if new is not None and (box := _around(compress(parts, new))) != block:
-                tile = _pasted(kept.tile, block, work(box), box)
-                now = patched(kept.made_from, today, new)
-                self._memory.save(name, KeptTile(now, tile, patched=True))
+            if new is not None and len(kept.patches) < MOST_PATCHES:
+                box = _around([extent.within(*block) or block for extent in compress(shown, new)])
+                inside = [extent.view for extent in shown if extent.within(*box)]
+                patch = Patch(_from(block, box), made_from(self._every, inside, exposure, settings))
+                tile = _pasted(kept.tile, block, work(box), patch.cells)
+                self._memory.save(name, KeptTile(kept.made_from, tile, (*kept.patches, patch)))
                 return tile
         found = work(block)
         self._memory.save(name, KeptTile(today, found))
         return found
 
-    def _new(self, kept: KeptTile, today: MadeFrom, parts: Sequence[Block]) -> Mask | None:
-        """Tell which of a tile's views are new (n,); None where others may not stay as they are."""
-        new = new_views(kept.made_from, today)
-        if new is None:
-            return None
-        options, cell_m = self._options, self._plan.grid.m_per_px
-        if kept.patched or new.any():
-            options = replace(
-                options,
-                keep_within_cells=PATCHED_SHARE * options.keep_within_cells,
-                keep_within_levels=PATCHED_SHARE * options.keep_within_levels,
-            )
-        corners_m = self._corners_m(list(compress(parts, ~new)))
-        stays = is_same(kept.made_from, only(today, ~new), corners_m, cell_m, options)
-        return new if stays else None
+    def _new(
+        self, kept: KeptTile, today: MadeFrom, block: Block, shown: Sequence[Extent]
+    ) -> Mask | None:
+        """Tell which of a tile's views are new (n,); None where the others may not stay."""
+        known = np.zeros(len(today.who), bool)
+        patches = [(patch.within(block), patch.made_from) for patch in kept.patches]
+        for box, record in ((block, kept.made_from), *patches):
+            there = taking_part(record, today)
+            if there is None:
+                return None
+            corners_m = self._corners_m([e.within(*box) or box for e in compress(shown, there)])
+            limits = self._plan.grid.m_per_px, self._options
+            if not is_same(record, only(today, there), corners_m, *limits):
+                return None
+            known |= there
+        return ~known
 
     def _corners_m(self, parts: Sequence[Block]) -> Floats:
         """Return the corners (n, 4, 2) of blocks of cells."""
@@ -204,20 +221,25 @@ def _around(parts: Iterable[Block]) -> Block:
     )
 
 
-def _pasted(tile: Tile | None, block: Block, patch: Tile | None, box: Block) -> Tile | None:
-    """Return a tile of a block with another's cells in a box of it."""
+def _from(block: Block, box: Block) -> tuple[int, int, int, int]:
+    """Return a box's rows and columns from the first of a block."""
+    row, column = block[0].start, block[1].start
+    return box[0].start - row, box[0].stop - row, box[1].start - column, box[1].stop - column
+
+
+def _pasted(
+    tile: Tile | None, block: Block, patch: Tile | None, cells: tuple[int, int, int, int]
+) -> Tile | None:
+    """Return a tile of a block with another's in these cells of it."""
     if patch is None:
         return tile
-    shape = block[0].stop - block[0].start, block[1].stop - block[1].start
-    (row, column), (rows, columns) = (block[0].start, block[1].start), patch.count.shape
-    first = box[0].start - row, box[1].start - column
-    cells = slice(first[0], first[0] + rows), slice(first[1], first[1] + columns)
-    layers = []
+    top, bottom, left, right = cells
+    shape, layers = (block[0].stop - block[0].start, block[1].stop - block[1].start), []
     for name in ("floor", "mean", "count"):
         new: np.ndarray[Any, Any] = getattr(patch, name)
         whole = np.zeros((*shape, *new.shape[2:]), new.dtype)
         if tile is not None:
             whole[:] = getattr(tile, name)
-        whole[cells] = new
+        whole[top:bottom, left:right] = new
         layers.append(whole)
     return Tile(*layers)

@@ -117,12 +117,11 @@ def stacked(records: Sequence[MadeFrom]) -> MadeFrom:
     )
 
 
-def new_views(kept: MadeFrom, today: MadeFrom) -> Mask | None:
-    """Tell (n,) which of today's views were not there, or None where some of those are gone."""
+def taking_part(kept: MadeFrom, today: MadeFrom) -> Mask | None:
+    """Tell (n,) which of today's views took part, or None where one that did is gone."""
     before = set(kept.who)
-    new = np.array([who not in before for who in today.who], bool)
-    rest = tuple(who for who in today.who if who in before)
-    return new if rest == kept.who else None
+    there = np.array([who in before for who in today.who], bool)
+    return there if tuple(compress(today.who, there)) == kept.who else None
 
 
 def only(record: MadeFrom, views: Mask) -> MadeFrom:
@@ -134,33 +133,6 @@ def only(record: MadeFrom, views: Mask) -> MadeFrom:
         place=record.place[views],
         limit_m=record.limit_m[views],
         colour=record.colour[views],
-    )
-
-
-def patched(kept: MadeFrom, today: MadeFrom, new: Mask) -> MadeFrom:
-    """Describe a part of which only what the new views show was made today.
-
-    Args:
-        kept: what it was made from before.
-        today: with the new views.
-        new: (n,) which of today's views these are.
-    """
-    lenses = [today.lenses[k] for k in today.lens_of_view]
-    place, limit_m, colour = today.place.copy(), today.limit_m.copy(), today.colour.copy()
-    place[~new], limit_m[~new], colour[~new] = kept.place, kept.limit_m, kept.colour
-    for k, lens in zip(np.flatnonzero(~new), kept.lens_of_view, strict=True):
-        lenses[k] = kept.lenses[lens]
-    number = {lens: k for k, lens in enumerate(dict.fromkeys(lenses))}
-    lens_of_view = np.array([number[lens] for lens in lenses])
-    return MadeFrom(
-        today.settings,
-        today.who,
-        tuple(number),
-        lens_of_view,
-        place,
-        limit_m,
-        colour,
-        kept.noise_levels,
     )
 
 
