@@ -8,9 +8,11 @@ import pytest
 from analytic_floor import make_camera, ring, rounded, view_of, waves
 
 from groundfuse.backend.measurement import Attitude, FrameId, Se2
-from groundfuse.frontend import made_from
+from groundfuse.frontend import made_from, mosaic_stream
+from groundfuse.frontend.kept_parts import MOST_PATCHES, Patch, _from, _pasted
 from groundfuse.frontend.mosaic import MosaicOptions, planned_mosaic
 from groundfuse.frontend.mosaic_plan import Layout, plan_mosaic
+from groundfuse.frontend.mosaic_tile import Tile
 from groundfuse.frontend.overhead import floor_from_rays, rays_from_floor
 
 CAMERA = make_camera(30.0)
@@ -122,6 +124,103 @@ def test_a_new_view_renders_its_own_tiles():
     assert every - parts.tiles_saved()
 
 
+WIDE = dataclasses.replace(OPTIONS, tile_cells=128)
+"""Tiles that a view shows a small part of."""
+
+
+def tiles_of(parts):
+    return [part for name, part in parts.items() if name.startswith("tile")]
+
+
+def test_a_new_view_renders_only_the_cells_around_it(monkeypatch):
+    """The view of A is not looked at again, although it lies in the same tiles."""
+    rendered = []
+    work = mosaic_stream._tile
+
+    def counted(scene, block, shown):
+        rendered.append((block[0].stop - block[0].start) * (block[1].stop - block[1].start))
+        return work(scene, block, shown)
+
+    first, second = team(1), team(1, robot="B", x_m=1.2)
+    parts = Parts()
+    made(first, WIDE, parts)
+    monkeypatch.setattr(mosaic_stream, "_tile", counted)
+    found = made([unreadable(first[0]), *second], WIDE, parts)
+    assert is_equal(found, made([*first, *second], WIDE))
+    (extent,) = plan_mosaic(second, WIDE).extents
+    num_cells = (extent.rows.stop - extent.rows.start) * (
+        extent.columns.stop - extent.columns.start
+    )
+    assert sum(rendered[: len(tiles_of(parts))]) == num_cells
+    assert all(len(tile.patches) == 1 for tile in tiles_of(parts))
+    parts.saved.clear()
+    nothing_new = [unreadable(view) for view in (*first, *second)]
+    assert is_equal(made(nothing_new, WIDE, parts), found)
+    assert not parts.tiles_saved()
+
+
+def test_new_views_beside_and_over_each_other_end_as_one_mosaic():
+    """One after the other, each patches what was patched before; too many, and all is made anew."""
+    views, parts, numbers = team(12), Parts(), []
+    for number in range(2, 13):
+        made(views[:number], WIDE, parts)
+        numbers.append(max(len(tile.patches) for tile in tiles_of(parts)))
+    assert is_equal(made(views, WIDE, parts), made(views, WIDE))
+    assert max(numbers) == MOST_PATCHES
+    assert numbers[-1] < MOST_PATCHES
+
+
+@pytest.mark.parametrize(("cells", "stays"), [(0.05, True), (-0.03, False)])
+def test_a_patch_is_judged_by_what_it_was_rendered_with(cells, stays):
+    """The first view has moved by 0.08 cells when the new one joins, and not when the rest was."""
+    views, parts = team(), Parts()
+    made(views[:-1], WIDE, parts)
+    near = moved(views, 0, 0.08)
+    first = made(near, WIDE, parts)
+    assert not is_equal(first, made(near, WIDE))  # the rest is not renewed
+    assert not is_equal(first, made(views, WIDE))  # the patch is
+    parts.saved.clear()
+    after = moved(views, 0, cells)
+    assert is_equal(made(after, WIDE, parts), first) == stays
+    assert bool(parts.tiles_saved()) != stays
+
+
+def test_a_view_that_was_only_patched_in_and_is_gone_leaves_nothing():
+    views, parts = team(), Parts()
+    made(views[:-1], WIDE, parts)
+    made(views, WIDE, parts)
+    assert any(tile.patches for tile in tiles_of(parts))
+    assert is_equal(made(views[:-1], WIDE, parts), made(views[:-1], WIDE))
+
+
+def test_the_cells_of_a_patch_stay_where_its_tile_is():
+    """A grid that grew has the tile at other rows and columns."""
+    block, box = (slice(8, 16), slice(16, 24)), (slice(9, 11), slice(18, 21))
+    patch = Patch(_from(block, box), record())
+    assert patch.cells == (1, 3, 2, 5)
+    assert patch.within(block) == box
+    assert patch.within((slice(0, 8), slice(40, 48))) == (slice(1, 3), slice(42, 45))
+
+
+def test_floor_that_no_view_saw_is_patched_in():
+    """Tiles of which nothing was seen are kept, too: far floor of the one is near for the other."""
+    block, cells = (slice(8, 12), slice(4, 10)), (1, 3, 2, 5)
+    new = Tile(
+        np.full((2, 3, 3), 7, np.uint8), np.full((2, 3, 3), 8, np.uint8), np.ones((2, 3), np.uint16)
+    )
+    found = _pasted(None, block, new, cells)
+    assert found.floor.shape == found.mean.shape == (4, 6, 3)
+    np.testing.assert_array_equal(np.argwhere(found.count), np.argwhere(found.floor[..., 0]))
+    assert found.count[1:3, 2:5].all()
+    assert found.count.sum() == 6
+    assert _pasted(found, block, None, cells) is found
+    assert _pasted(None, block, None, cells) is None
+    again = _pasted(found, block, Tile(new.mean, new.floor, new.count), (0, 2, 2, 5))
+    assert (found.floor[1:3, 2:5] == 7).all()  # what it was pasted on stays as it was
+    assert (again.floor[0:2, 2:5] == 8).all()
+    assert (again.floor[2, 2:5] == 7).all()
+
+
 def test_only_what_is_new_or_moved_is_sampled():
     views, parts = team(), Parts()
     made(views[:-1], LIGHT, parts)
@@ -215,7 +314,7 @@ def changed_team():
     return views[:-1], after
 
 
-@pytest.mark.parametrize("options", [OPTIONS, LIGHT])
+@pytest.mark.parametrize("options", [OPTIONS, LIGHT, dataclasses.replace(OPTIONS, tile_cells=16)])
 def test_an_interrupted_run_ends_as_an_undisturbed_one(options):
     """Whatever was renewed before the end: the same parts stay, the same are renewed."""
     before, after = changed_team()
@@ -226,6 +325,7 @@ def test_an_interrupted_run_ends_as_an_undisturbed_one(options):
     assert not is_equal(expected, made(after, options))  # something was kept
     num_saved = len(whole.saved)
     assert num_saved > 20
+    assert options.compensate or any(tile.patches for tile in tiles_of(whole))
     for left in range(0, num_saved, 11):
         parts = Parts(start, left)
         with pytest.raises(KeyboardInterrupt):
