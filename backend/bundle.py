@@ -13,7 +13,7 @@ from itertools import compress
 
 import numpy as np
 
-from groundfuse.backend.bundle_again import going_on
+from groundfuse.backend.bundle_again import Warm, going_on
 from groundfuse.backend.bundle_cholesky import NotPositiveDefiniteError
 from groundfuse.backend.bundle_cut import Cut, cut, link_chi2
 from groundfuse.backend.bundle_estimate import (
@@ -30,6 +30,7 @@ from groundfuse.backend.bundle_files import (
     with_better_files,
 )
 from groundfuse.backend.bundle_model import State
+from groundfuse.backend.bundle_place import agrees, noise_of, placed_among_known
 from groundfuse.backend.bundle_priors import Priors
 from groundfuse.backend.bundle_relief import settle_relief
 from groundfuse.backend.bundle_report import Ends, report
@@ -137,7 +138,7 @@ def bundle(
     warm = None if earlier is None else going_on(earlier, start, team, priors, cameras)
     try:
         if earlier is not None and warm is not None:
-            again = _gone_on(job, *warm)
+            again = _gone_on(job, warm)
             if again is not None:
                 return report(Ends(start, team, cameras, options, earlier.settled_frames), *again)
         found = _solved(job, priors, state)
@@ -157,7 +158,7 @@ def _solved(job: Job, priors: Priors, state: State) -> Solved | BundleRefusal:
         return first
     # Right correspondences contradict a wrong file: free its numbers before any of them are cut.
     priors, rough, state = settled_files(*first, options, job.settled_trial)
-    clean = _cleaned(job, priors, rough, state)
+    clean = _cleaned(job, priors, rough.noise, state)
     joined = _joined(job, clean)
     num_frames = len(job.team.frames)
     most = max(options.trial_sightings // num_frames, LEAST_TRIAL)
@@ -169,7 +170,7 @@ def _solved(job: Job, priors: Priors, state: State) -> Solved | BundleRefusal:
     state = better.state
     if relief > 0.0:
         priors, state = _judged_anew(trial[0], better, relief, options)
-        clean = _cleaned(job, priors, better, state)
+        clean = _cleaned(job, priors, better.noise, state)
         joined = _joined(job, clean)
     last = _last(job, clean, priors, state, joined)
     if isinstance(last, BundleRefusal):
@@ -178,17 +179,38 @@ def _solved(job: Job, priors: Priors, state: State) -> Solved | BundleRefusal:
     return problem, solution, clean, test
 
 
-def _gone_on(job: Job, priors: Priors, state: State) -> Solved | None:
+def _gone_on(job: Job, warm: Warm) -> Solved | None:
     """Take in what is new; None where what was judged before no longer holds."""
-    first = _rough(job, priors, state)
-    if isinstance(first, BundleRefusal):
-        return None
-    clean = _cleaned(job, priors, first[1], first[1].state)
-    last = _last(job, clean, priors, first[1].state, _joined(job, clean))
+    priors, found = warm.priors, _placed(job, warm)
+    if found is None:
+        first = _rough(job, priors, warm.state)
+        if isinstance(first, BundleRefusal):
+            return None
+        state, noise = first[1].state, first[1].noise
+        found = state, _cleaned(job, priors, noise, state)
+    state, clean = found
+    last = _last(job, clean, priors, state, _joined(job, clean))
     if isinstance(last, BundleRefusal):
         return None
     problem, solution, test = with_better_files(*last, job.options, SETTLED)
     return (problem, solution, clean, test) if problem is last[0] else None
+
+
+def _placed(job: Job, warm: Warm) -> tuple[State, Cut] | None:
+    """Place the new frames among the known and cut; None where these have to move for that."""
+    priors, links, seen = warm.priors, job.links, job.sightings
+    if priors.relief > 0.0:
+        return None
+    state = placed_among_known(links, seen, warm.state, priors, warm.known, job.options)
+    if state is None:
+        return None
+    chi2 = link_chi2(links, seen, state, priors, 1.0)
+    # Where much contradicts what was known, the noise seems larger, and nothing wrong.
+    noise = min(noise_of(chi2), warm.noise)
+    wrong = chi2 > (job.options.link_gate_sigma * noise) ** 2
+    if not agrees(links, wrong, job.edges, warm.rejected):
+        return None
+    return state, cut(links, job.edges, wrong, job.options)
 
 
 def _rough(
@@ -226,9 +248,9 @@ def _joined(job: Job, clean: Cut) -> Points:
     return tracks(clean.links, job.sightings) if job.options.tracks else single_links(clean.links)
 
 
-def _cleaned(job: Job, priors: Priors, rough: Solution, state: State) -> Cut:
+def _cleaned(job: Job, priors: Priors, noise: float, state: State) -> Cut:
     """Cut the correspondences that do not meet on the floor."""
-    chi2 = link_chi2(job.links, job.sightings, state, priors, rough.noise)
+    chi2 = link_chi2(job.links, job.sightings, state, priors, noise)
     return cut(job.links, job.edges, chi2 > job.options.link_gate_sigma**2, job.options)
 
 

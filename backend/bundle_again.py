@@ -6,7 +6,7 @@ same, up to the last step's length; what was judged is judged again once the tea
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +16,31 @@ from groundfuse.backend.bundle_estimate import BundleCamera, BundleEstimate, Mou
 from groundfuse.backend.bundle_model import State
 from groundfuse.backend.bundle_priors import Priors, offset_units
 from groundfuse.backend.bundle_setup import Team
-from groundfuse.backend.measurement import FrameId, Se2, TeamEstimate
+from groundfuse.backend.measurement import FrameId, Rejected, Se2, TeamEstimate
 
 Array = NDArray[np.float64]
 
 MOST_GROWTH = 1.5
 """A team this many times as large as when floor and files were judged last starts over."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Warm:
+    """Where an earlier bundle ended.
+
+    Attributes:
+        priors: with free what was free.
+        state: without floor points; new frames lie nearly where they belong.
+        known: (frames,) which frames it knows.
+        rejected: pairs that it turned down.
+        noise: see `noise_factor` of `BundleEstimate`.
+    """
+
+    priors: Priors
+    state: State
+    known: NDArray[np.bool_]
+    rejected: tuple[Rejected, ...]
+    noise: float
 
 
 def going_on(
@@ -30,8 +49,8 @@ def going_on(
     team: Team,
     priors: Priors,
     cameras: Mapping[str, BundleCamera],
-) -> tuple[Priors, State] | None:
-    """Return priors and state of an earlier bundle, or None where too much is new.
+) -> Warm | None:
+    """Return where an earlier bundle ended, or None where too much is new.
 
     A frame that it does not know is put where the Pose2 graph has it beside the nearest frame that
     it does.
@@ -48,6 +67,7 @@ def going_on(
     poses = _known(earlier.team, start, team)
     if poses is None:
         return None
+    is_known = np.array([f in poses and f in earlier.attitude for f in team.frames])
     poses |= _beside(poses, start)
     mounts = {mount.robot: mount for mount in earlier.mounts}
     shared = np.array([_shared(mounts.get(name)) for name in team.robots])
@@ -58,7 +78,8 @@ def going_on(
             attitude[index] = known.tilt_rad, known.roll_rad, known.height_m
     feet = [(poses[f] @ cameras[f.robot].base_from_foot).vector() for f in team.frames]
     state = State(np.array(feet), attitude, shared, np.zeros((0, 3)))
-    return _judged(priors, team, mounts, earlier.relief), state
+    judged = _judged(priors, team, mounts, earlier.relief)
+    return Warm(judged, state, is_known, earlier.rejected, earlier.noise_factor)
 
 
 def _known(earlier: TeamEstimate, start: TeamEstimate, team: Team) -> dict[FrameId, Se2] | None:

@@ -1,5 +1,6 @@
 """Robust damped Gauss-Newton over the bundle's unknowns; numpy only."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,8 +28,11 @@ from groundfuse.backend.bundle_tracks import Observations
 Array = NDArray[np.float64]
 
 FIRST_DAMPING, MOST_DAMPING = 1e-6, 1e6
-CHORD_GAIN = 0.3
-"""A step whose chi-square is more than this share of the last one's asks for new derivatives."""
+FRESH_GAIN = 0.5
+"""Share of the last step's chi-square that a step with new derivatives has, about: weights that
+follow the residuals keep it from less."""
+SYSTEM_STEPS = 5.0
+"""So many steps take as long as new derivatives and their factor."""
 ROUNDING = 1e-7
 """Share of the cost by which it may rise in a step that is as good as none."""
 NOISE_CHANGE = 0.1
@@ -200,8 +204,8 @@ def minimise(
             state, errors, steps = tried, tried_errors, steps + 1
             done = chi2 < settled and system.damping == 0.0
             damping = system.damping / 10.0 if system.damping > FIRST_DAMPING else 0.0
-            # Unless another step as good as this one is the last.
-            slow = chi2 > CHORD_GAIN * last_chi2 and chi2**2 > settled * last_chi2 and not done
+            fresh = SYSTEM_STEPS + _steps_left(chi2, settled, FRESH_GAIN)
+            slow = _steps_left(chi2, settled, chi2 / last_chi2) > fresh
             system, last_chi2 = (None, np.inf) if slow or damping else (system, chi2)
         elif last_chi2 < np.inf:
             system, last_chi2 = None, np.inf
@@ -211,6 +215,13 @@ def minimise(
         else:
             done = True
     return Solution(state, errors, kernel.weight(errors), kernel.noise, absorbed, steps, done)
+
+
+def _steps_left(chi2: float, settled: float, gain: float) -> float:
+    """Return how many steps it takes until their chi-square is settled, if each has this share."""
+    if chi2 < settled or gain == 0.0:
+        return 0.0
+    return math.log(settled / chi2) / math.log(gain) if gain < 1.0 else math.inf
 
 
 def _damped_system(

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from bundle_world import Robot, loop_path, pair_team, simulate
 
+from groundfuse.backend import bundle as module
 from groundfuse.backend.bundle import bundle
 from groundfuse.backend.bundle_again import MOST_GROWTH
 from groundfuse.backend.bundle_estimate import BundleEstimate, BundleOptions
@@ -73,6 +74,44 @@ def test_new_frames_end_where_a_bundle_from_nothing_does(seed, new):
         assert got.tilt_rad.sigma == pytest.approx(true.tilt_rad.sigma, rel=0.05)
 
 
+def counted_rough(monkeypatch):
+    """Count how often all frames move before correspondences are judged."""
+    calls, work = [], module._rough
+
+    def rough(*arguments, **others):
+        calls.append(arguments)
+        return work(*arguments, **others)
+
+    monkeypatch.setattr(module, "_rough", rough)
+    return calls
+
+
+def test_a_new_frame_that_agrees_moves_nobody_before_the_end(monkeypatch):
+    team, new = world(1), {FrameId("B", 12)}
+    earlier = solved(without(team, new))
+    calls = counted_rough(monkeypatch)
+    found = solved(team.arguments, earlier)
+    assert found.settled_frames == earlier.settled_frames
+    assert calls == []
+
+
+def test_new_frames_that_contradict_what_was_known_move_all(monkeypatch):
+    """As the picture that closes a long loop: half of the known frames are 2 cm off the others."""
+    team, new = world(2), {FrameId("A", 6), FrameId("B", 12)}
+    wanted, earlier = solved(team.arguments), solved(without(team, new))
+    bent = {
+        frame: Se2(0.02 * (frame.robot == "B"), 0.0, 0.0) @ pose
+        for frame, pose in earlier.team.team_from_base.items()
+    }
+    calls = counted_rough(monkeypatch)
+    wrong = replace(earlier, team=replace(earlier.team, team_from_base=bent))
+    found = solved(team.arguments, wrong)
+    assert len(calls) == 1
+    assert found.settled_frames == earlier.settled_frames
+    assert not found.rejected
+    assert off_sigma(found, wanted) < TOLERANCE_SIGMA
+
+
 def test_a_new_robot_is_taken_in():
     shape = (*pair_team(), Robot("C", loop_path(10, (0.2, 0.5), phase=2.0), tilt_deg=40.0))
     team = world(3, shape)
@@ -134,14 +173,16 @@ def test_what_was_free_stays_free_and_what_turns_out_wrong_is_judged_anew():
     assert identical(solved(team.arguments, replace(wanted, mounts=blind)), wanted)
 
 
-def test_a_floor_with_relief_stays_one():
+def test_a_floor_with_relief_stays_one(monkeypatch):
     def waves(floor, _):
         return 0.003 * np.sin(20.0 * floor[:, 0]) * np.sin(20.0 * floor[:, 1])
 
     team = world(8, relief=waves, noise_px=0.3)
     wanted = solved(team.arguments)
     assert wanted.relief > 0.0
+    calls = counted_rough(monkeypatch)
     found = solved(team.arguments, replace(wanted, settled_frames=20))
+    assert len(calls) == 1  # points land elsewhere for each camera
     assert found.settled_frames == 20
     assert found.relief == wanted.relief
     assert off_sigma(found, wanted) < TOLERANCE_SIGMA
