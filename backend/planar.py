@@ -16,8 +16,11 @@ SMALL_RAD = 1e-4  # below it the series is exact to 1e-17
 
 def wrapped(theta_rad: Array) -> Array:
     """Return angles in [-pi, pi]; values already inside come back unchanged to the bit."""
+    is_inside = np.abs(theta_rad) <= np.pi
+    if np.all(is_inside):  # mostly, and remainders take long
+        return np.array(theta_rad)
     turned = np.remainder(theta_rad + np.pi, 2.0 * np.pi) - np.pi
-    inside: Array = np.where(np.abs(theta_rad) <= np.pi, theta_rad, turned)
+    inside: Array = np.where(is_inside, theta_rad, turned)
     return inside
 
 

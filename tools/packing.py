@@ -223,6 +223,12 @@ def _kind(name: str) -> Callable[..., Any]:
 
 
 @functools.cache
+def _member(name: str, value: object) -> Any:  # noqa: ANN401
+    """Return a member of one of our enumerations: there are few, and they come in thousands."""
+    return _kind(name)(value)
+
+
+@functools.cache
 def _maker(name: str) -> Callable[..., Any]:
     """Return what makes a class's values of their parts.
 
@@ -256,7 +262,7 @@ def _value(outline: Any, arrays: memoryview) -> Any:  # noqa: ANN401, PLR0911
     if kind == "B":
         return bytes.fromhex(outline[1])
     if kind == "E":
-        return _kind(outline[1])(outline[2])
+        return _member(outline[1], outline[2])
     if kind == "C":
         rows = zip(*_values(outline[2:], arrays), strict=True)
         return tuple(itertools.starmap(_maker(outline[1]), rows))
