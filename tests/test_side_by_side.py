@@ -63,6 +63,7 @@ def test_callers_in_several_threads_share_the_threads():
 
 FORK = """
 import os
+import signal
 import sys
 import time
 from groundfuse.backend.side_by_side import LEAST_ITEMS, side_by_side
@@ -79,6 +80,7 @@ def work(part):
 side_by_side(work, LEAST_ITEMS)
 time.sleep(0.05)  # and for each thread to wait for more
 child = os.fork()
+signal.alarm(15)  # whoever waits for ever ends
 side_by_side(work, LEAST_ITEMS)
 assert len(done) == 6
 sys.exit(0 if child == 0 else os.waitpid(child, 0)[1])
