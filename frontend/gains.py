@@ -8,7 +8,7 @@ own colours are eliminated cell by cell; what stands on the floor is outvoted (C
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -151,9 +151,9 @@ def _floor(samples: Samples, order: Numbers, number: Numbers, lens_of_view: Numb
     of_run = np.append(np.flatnonzero(is_first), len(view))
     runs_of_cell = np.searchsorted(of_run, begins)
     shape = len(number), num_views
-    by_view = sparse.csr_array((np.arange(len(view)), view, begins), shape).tocsc()
+    by_view = sparse.csc_array(sparse.csr_array((np.arange(len(view)), view, begins), shape))
     seen = sparse.csr_array((np.ones(len(view), np.bool_), view, begins), shape)
-    together = sparse.triu(seen.T @ seen, format="csr")
+    together = sparse.csr_array(sparse.triu(seen.T @ seen))
     together.sort_indices()
     return _Floor(
         (_short(view), _short(lens), samples.radius2[order], values),
@@ -169,7 +169,7 @@ def _ends(number: Numbers) -> Numbers:
     return np.append(0, np.cumsum(number))
 
 
-def _short(numbers: Numbers) -> Short:
+def _short(numbers: np.ndarray[Any, Any]) -> Short:
     """Return places that compiled loops need not check for counting from the end."""
     return numbers.astype(np.uint32)
 
