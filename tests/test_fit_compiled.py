@@ -40,8 +40,9 @@ def rows_of(rays_a, motion, camera_a, camera_b):
 def test_rows_are_those_of_the_shared_model(camera_a, motion, camera_b, seed):
     """Points behind a camera included; relative to the largest of a point's rows.
 
-    A point farther off than ten camera heights is left out: its place is rounded by so much.
-    Worst seen over 160 000 points 7e-13.
+    A point farther off than ten camera heights is left out, and one within 0.06 deg of the horizon
+    of the other camera, whose ray is longer than 1000: places and rays are rounded by so much.
+    Worst seen over 210 000 points 3e-13; up to rays of 1e5, 3e-12.
     """
     rays = np.random.default_rng(seed).uniform(-1.0, 1.0, (40, 2))
     rows = rows_of(rays, motion, camera_a, camera_b)
@@ -52,7 +53,8 @@ def test_rows_are_those_of_the_shared_model(camera_a, motion, camera_b, seed):
     scale = np.abs(wanted).max(axis=(1, 2), keepdims=True)
     np.testing.assert_array_equal(np.isnan(rows), np.isnan(wanted))
     place = np.hypot(*floor_from_rays(Attitude(*camera_a), rays).T)
-    rows, wanted, scale = (part[~(place > 10.0 * camera_a[2])] for part in (rows, wanted, scale))
+    far = (place > 10.0 * camera_a[2]) | (np.hypot(*got.rays_b.T) > 1000.0)
+    rows, wanted, scale = (part[~far] for part in (rows, wanted, scale))
     np.testing.assert_allclose(rows / scale, wanted / scale, rtol=0.0, atol=1e-12)
 
 
