@@ -202,10 +202,11 @@ def minimise(
         before = _cost(problem, state, errors, kernel)
         if _cost(problem, tried, tried_errors, kernel) < before + settled + ROUNDING * before:
             state, errors, steps = tried, tried_errors, steps + 1
-            done = chi2 < settled and system.damping == 0.0
+            gain = chi2 / last_chi2
+            # A short step after one that was hardly longer has as much before it again.
+            done = chi2 < settled and system.damping == 0.0 and gain <= FRESH_GAIN
             damping = system.damping / 10.0 if system.damping > FIRST_DAMPING else 0.0
-            fresh = SYSTEM_STEPS + _steps_left(chi2, settled, FRESH_GAIN)
-            slow = _steps_left(chi2, settled, chi2 / last_chi2) > fresh
+            slow = not done and _steps_left(chi2, settled, gain) > _steps_anew(chi2, settled)
             system, last_chi2 = (None, np.inf) if slow or damping else (system, chi2)
         elif last_chi2 < np.inf:
             system, last_chi2 = None, np.inf
@@ -219,9 +220,16 @@ def minimise(
 
 def _steps_left(chi2: float, settled: float, gain: float) -> float:
     """Return how many steps it takes until their chi-square is settled, if each has this share."""
-    if chi2 < settled or gain == 0.0:
+    if gain == 0.0:
         return 0.0
-    return math.log(settled / chi2) / math.log(gain) if gain < 1.0 else math.inf
+    if chi2 < settled or gain >= 1.0:  # the former is not done, or nobody would ask
+        return math.inf
+    return math.log(settled / chi2) / math.log(gain)
+
+
+def _steps_anew(chi2: float, settled: float) -> float:
+    """Return how many steps it takes with new derivatives, which take as long as some."""
+    return SYSTEM_STEPS + max(math.log(settled / chi2) / math.log(FRESH_GAIN), 0.0)
 
 
 def _damped_system(
