@@ -58,6 +58,9 @@ def placed_among_known(
         known: (frames,) which frames stay.
         options: see there.
     """
+    new = np.flatnonzero(~known)
+    if not len(new):
+        return state
     new_a, new_b = ~known[sightings.frame[links.a]], ~known[sightings.frame[links.b]]
     one = new_a != new_b
     mine = np.where(new_a, links.a, links.b)[one]
@@ -66,14 +69,13 @@ def placed_among_known(
     frame, ray = sightings.frame[other], sightings.ray[other]
     landing = floor_points(frame, ray, gain, state, priors.robot_of).point
     met = np.isfinite(landing[:, 0])
-    new = np.flatnonzero(~known)
     count = np.bincount(sightings.frame[mine[met]], minlength=len(known))
-    if count[new].min(initial=options.min_links) < options.min_links:
+    if count[new].min() < options.min_links:
         return None
     seen = observations(sightings, mine[met], np.arange(int(met.sum())), len(known))
     points = np.column_stack([landing[met], np.zeros(len(seen.frame))])
     begun = State(state.pose, state.attitude, state.shared, points)
-    return _settled(seen, begun, priors, new, options) if len(new) else state
+    return _settled(seen, begun, priors, new, options)
 
 
 def _settled(

@@ -202,7 +202,7 @@ def minimise(
         before = _cost(problem, state, errors, kernel)
         if _cost(problem, tried, tried_errors, kernel) < before + settled + ROUNDING * before:
             state, errors, steps = tried, tried_errors, steps + 1
-            gain = chi2 / last_chi2
+            gain = chi2 / last_chi2 if last_chi2 > 0.0 else 0.0
             # A short step after one that was hardly longer has as much before it again.
             done = chi2 < settled and system.damping == 0.0 and gain <= FRESH_GAIN
             damping = system.damping / 10.0 if system.damping > FIRST_DAMPING else 0.0
@@ -229,7 +229,9 @@ def _steps_left(chi2: float, settled: float, gain: float) -> float:
 
 def _steps_anew(chi2: float, settled: float) -> float:
     """Return how many steps it takes with new derivatives, which take as long as some."""
-    return SYSTEM_STEPS + max(math.log(settled / chi2) / math.log(FRESH_GAIN), 0.0)
+    if chi2 <= settled:
+        return SYSTEM_STEPS
+    return SYSTEM_STEPS + math.log(settled / chi2) / math.log(FRESH_GAIN)
 
 
 def _damped_system(
