@@ -1,13 +1,15 @@
-"""Freed memory goes back to the system."""
+"""Freed memory is kept for the next piece, and goes back to the system after a long stage."""
 
 import gc
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from groundfuse.tools import memory
-from groundfuse.tools.memory import give_back
+from groundfuse.tools.memory import give_back, keep_freed
 from groundfuse.tools.pipeline import Stopwatch
 
 MEBIBYTE = 2**20
@@ -48,8 +50,39 @@ def test_so_it_does_after_a_stage_that_took_long(pieces, seconds, goes, monkeypa
     assert len(pieces) == 8
 
 
+FAULTS = """
+import resource, sys
+import numpy as np
+from groundfuse.tools.memory import keep_freed
+if sys.argv[1] == "kept" and not keep_freed():
+    sys.exit(3)
+np.ones(2**24, np.uint8)  # what the first piece of a size teaches the library by itself
+begin = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+for _ in range(20):
+    pieces = [np.ones(2**22, np.uint8), np.ones(2**22, np.uint8), np.ones(2**22, np.uint8)]
+    del pieces
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - begin)
+"""
+
+
+def test_freed_memory_is_kept_for_the_next_piece():
+    ran = {
+        how: subprocess.run(  # settings of the whole process, so in one of its own
+            [sys.executable, "-c", FAULTS, how], capture_output=True, text=True, check=False
+        )
+        for how in ("kept", "usual")
+    }
+    if ran["kept"].returncode == 3:
+        pytest.skip("this C library has no mallopt")
+    faults = {how: int(done.stdout) for how, done in ran.items()}
+    once = 3 * 2**22 // PAGE_BYTES
+    assert faults["kept"] < 2 * once
+    assert faults["usual"] > 5 * faults["kept"]
+
+
 def test_another_c_library_is_left_alone(monkeypatch):
-    memory._trim.cache_clear()
+    memory._of_library.cache_clear()
     monkeypatch.setattr("ctypes.CDLL", lambda _: object())
     assert not give_back()
-    memory._trim.cache_clear()
+    assert not keep_freed()
+    memory._of_library.cache_clear()

@@ -29,6 +29,7 @@ from groundfuse.tools.bench_scale_fleets import fleet, twice_mown
 from groundfuse.tools.bench_scale_runs import Growth, grown, matching_s, recalls, reruns, speeds
 from groundfuse.tools.errors import TeamError
 from groundfuse.tools.front_end_options import Matcher
+from groundfuse.tools.memory import keep_freed
 
 STAGES = ("features", "retrieval", "pairs", "graphs", "patches", "bundle", "mosaic")
 WARMING = 2
@@ -145,6 +146,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command.add_argument("--keep", type=Path, help="folder of rendered fleets")
     asked = command.parse_args(arguments)
     cv2.setNumThreads(1)
+    keep_freed()  # as the command does
     try:
         with tempfile.TemporaryDirectory() as temporary:
             folder = asked.keep or Path(temporary)

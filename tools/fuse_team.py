@@ -38,6 +38,7 @@ from groundfuse.tools.files import make_folder, write_atomic
 from groundfuse.tools.finished import unless_finished
 from groundfuse.tools.floor_check import check_floor
 from groundfuse.tools.front_end_options import Matcher, with_matcher
+from groundfuse.tools.memory import keep_freed
 from groundfuse.tools.one_line_parser import INTERRUPTED
 from groundfuse.tools.open3d_check import check_with_open3d
 from groundfuse.tools.outputs import (
@@ -92,6 +93,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     asked = parser().parse_args(arguments)
     logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.INFO)
     cv2.setNumThreads(1)
+    keep_freed()
     gc.freeze()  # what imports have made stays: no search for garbage goes through it again
     try:
         run(asked)
