@@ -16,9 +16,9 @@ import numpy as np
 from groundfuse.backend.measurement import Se2
 from groundfuse.backend.option_checks import check_numbers
 from groundfuse.frontend.arrays import Floats, Mask, Points
-from groundfuse.frontend.consensus_draws import allowed, distinct, draw
+from groundfuse.frontend.candidates_compiled import laid_out
+from groundfuse.frontend.consensus_compiled import search
 from groundfuse.frontend.consensus_table import Limits, Table
-from groundfuse.frontend.consensus_votes import climb, count_votes
 from groundfuse.frontend.middle import middle
 
 
@@ -125,37 +125,19 @@ def find_modes(
         return []
     table = _table(found)
     limits = _limits(found, tolerance_m, max_log_scale, options, gate)
-    motions = np.empty((options.max_hypotheses, 4))
-    motions = motions[: draw(table, rng.random((2, options.num_draws)), limits, motions)]
-    votes = np.zeros(len(motions), dtype=np.int64)
-    count_votes(table, motions, limits, votes)
-    modes: list[Mode] = []
-    known = np.empty((options.num_modes, 4))
-    while len(motions) and len(modes) < options.num_modes:
-        start = motions[int(np.argmax(votes))]
-        best, voters = start.copy(), np.zeros(len(found.index_a), dtype=np.bool_)
-        count = climb(table, best, limits, options.refinements, voters)
-        # A start on the slope of a known mode climbs back to it: no rival. One at the edge of the
-        # gate may climb out of it.
-        if allowed(best, limits) and distinct(known[: len(modes)], best, limits).all():
-            known[len(modes)] = best
-            modes.append(_mode(best, count, voters))
-        apart = distinct(motions, best, limits) & distinct(motions, start, limits)
-        motions, votes = motions[apart], votes[apart]
+    draws = rng.random((2, options.num_draws))
+    motions, votes = np.empty((options.num_modes, 4)), np.empty(options.num_modes, dtype=np.int64)
+    voters = np.empty((options.num_modes, len(found.index_a)), dtype=np.bool_)
+    most, steps = options.max_hypotheses, options.refinements
+    count = search(table, draws, limits, most, steps, motions, votes, voters)
+    modes = [_mode(motions[k], int(votes[k]), voters[k]) for k in range(count)]
     return sorted(modes, key=lambda mode: -mode.votes)
 
 
 def _table(found: Candidates) -> Table:
     """Lay candidates out for the compiled loops."""
-    count = len(found.index_a)
-    places, turned = np.empty((count, 4)), np.empty((count, 2), dtype=np.float32)
-    places[:, :2], places[:, 2:] = found.floor_a, found.floor_b
-    turn_rad = found.turn_rad.astype(np.float32)
-    turned[:, 0], turned[:, 1] = np.cos(turn_rad), np.sin(turn_rad)
-    first = np.flatnonzero(found.index_a[1:] != found.index_a[:-1]) + 1
-    starts = np.concatenate([[0], first, [count]])
-    cumulative = np.cumsum(1.0 / (1.0 + found.rank))
-    return Table(places, turned, cumulative, starts, found.index_b, int(found.index_b.max()) + 1)
+    laid = laid_out(found.floor_a, found.floor_b, found.index_a, found.rank, found.turn_rad)
+    return Table(*laid, found.index_b, int(found.index_b.max()) + 1)
 
 
 def _limits(

@@ -8,6 +8,7 @@ import numpy as np
 
 from groundfuse.backend.measurement import Correspondences, Reason
 from groundfuse.backend.option_checks import check_numbers
+from groundfuse.frontend.candidates_compiled import of_like_size
 from groundfuse.frontend.consensus import (
     Candidates,
     ConsensusOptions,
@@ -117,11 +118,8 @@ def candidates(a: Features, b: Features, options: MatchOptions) -> Candidates:
     count = min(options.num_neighbours, len(b))
     nearest = np.empty((len(a), count), dtype=np.int64)
     _find_nearest(a.descriptors, b.descriptors, nearest)
-    index_b = nearest.ravel()
-    index_a = np.repeat(np.arange(len(a)), count)
-    rank = np.tile(np.arange(count), len(a))
-    alike = np.abs(a.log_size[index_a] - b.log_size[index_b]) < options.max_log_size
-    index_a, index_b, rank = index_a[alike], index_b[alike], rank[alike]
+    sizes = a.log_size, b.log_size
+    index_a, index_b, rank = of_like_size(nearest, *sizes, options.max_log_size)
     turn_rad = a.angle_rad[index_a] - b.angle_rad[index_b]
     places = a.floor_m.take(index_a, axis=0), b.floor_m.take(index_b, axis=0)
     return Candidates(*places, index_a, index_b, rank, turn_rad)

@@ -19,8 +19,15 @@ from groundfuse.frontend.consensus import (
     _table,
     find_modes,
 )
-from groundfuse.frontend.consensus_draws import _apart, _guide, _picked, draw
-from groundfuse.frontend.consensus_votes import _fit, climb, count_votes
+from groundfuse.frontend.consensus_compiled import (
+    _apart,
+    _fit,
+    _guide,
+    _picked,
+    climb,
+    count_votes,
+    draw,
+)
 
 TOLERANCE_M = 0.01
 OPTIONS = ConsensusOptions(num_draws=8000)

@@ -26,7 +26,8 @@ def keep_freed() -> bool:
     if mallopt is None:
         return False
     settings = ((M_MMAP_THRESHOLD, LARGE_BYTES), (M_TRIM_THRESHOLD, FREE_BYTES))
-    return all([mallopt(name, value) == 1 for name, value in settings])
+    done = [mallopt(name, value) for name, value in settings]
+    return done == [1, 1]
 
 
 def give_back() -> bool:
