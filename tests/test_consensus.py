@@ -338,6 +338,24 @@ def test_moving_a_view_moves_the_motion():
     assert new.votes == old.votes
 
 
+@given(st.integers(0, 2**16), st.integers(1, 200))
+@settings(max_examples=30)
+def test_candidates_laid_out(seed, count):
+    """Against numpy: each rank's weight, and where each feature of a begins."""
+    rng = np.random.default_rng(seed)
+    floor, turn = rng.normal(size=(2, count, 2)), rng.uniform(-7.0, 7.0, count)
+    index_a, index_b = np.sort(rng.integers(0, 40, count)), rng.integers(0, 40, count)
+    rank = rng.integers(0, 5, count)
+    table = _table(Candidates(*floor, index_a, index_b, rank, turn))
+    np.testing.assert_array_equal(table.places, np.hstack(floor))
+    np.testing.assert_array_equal(table.cumulative, np.cumsum(1.0 / (1.0 + rank)))
+    np.testing.assert_array_equal(table.starts[:-1], np.unique(index_a, return_index=True)[1])
+    assert table.starts[-1] == count
+    assert table.num_b == index_b.max() + 1
+    exact = np.column_stack([np.cos(turn), np.sin(turn)])
+    np.testing.assert_allclose(table.turned, exact, atol=np.finfo(np.float32).eps / 2.0)
+
+
 @given(st.integers(0, 2**16))
 @settings(max_examples=30)
 def test_voters_are_one_to_one_and_the_nearest(seed):
