@@ -158,6 +158,36 @@ def test_others_of_a_kind_are_forgotten_and_leave_room(path):
     assert path.stat().st_size <= size
 
 
+def test_of_what_is_superseded_the_latest_stay(path):
+    """Of each kind and label apart; whatever else there is stays."""
+    with Store(path) as store:
+        for k in range(6):
+            for kind, label in (("graph", "A"), ("graph", "B"), ("bundle", "A"), ("look", "A")):
+                put(store, k, f"{kind} {label} {k}".encode(), kind, label)
+        put(store, 0, b"graph A 1", "graph", "A")  # kept again: now the latest
+        store.forget_older(("graph", "bundle"), 2)
+        left = {f"{what} {k}" for what in ("graph B", "bundle A") for k in (4, 5)}
+        left |= {f"look A {k}" for k in range(6)} | {"graph A 1", "graph A 5"}
+        everything = [
+            f"{w} {k}" for w in ("graph A", "graph B", "bundle A", "look A") for k in range(6)
+        ]
+        assert store.known(name.encode() for name in everything) == {name.encode() for name in left}
+
+
+@pytest.mark.parametrize("before", ["none", "without"])
+def test_a_kind_is_found_without_reading_everything(path, before):
+    """Also in a store that was made without the index."""
+    if before == "without":
+        with Store(path) as store:
+            put(store, 1, b"k", "number")
+        rows(path, "DROP INDEX entry_by_kind")
+    with Store(path) as store:
+        put(store, 2, b"m", "number")
+        assert store.latest("number") == 2
+    plan = "EXPLAIN QUERY PLAN SELECT id FROM entry WHERE kind = 'number' ORDER BY id DESC"
+    assert "USING COVERING INDEX entry_by_kind" in str(rows(path, plan))
+
+
 def test_fresh_starts_over(path):
     with Store(path) as store:
         put(store, 1)

@@ -67,6 +67,7 @@ from groundfuse.tools.pipeline import (
 from groundfuse.tools.robot import Robot
 from groundfuse.tools.settings import record, with_settings
 from groundfuse.tools.store import STORE, Store
+from groundfuse.tools.superseded import forget_superseded
 from groundfuse.tools.team_folder import list_robots, read_team
 from groundfuse.tools.view3d import view_ply, write_ply
 from groundfuse.tools.workers import Threads, Workers
@@ -126,6 +127,7 @@ def run(asked: argparse.Namespace) -> Fused:
         desk = _Desk(asked, out, options, store, watch)
         with _workers(asked) as workers:
             fused, old = _fused(desk, robots, workers)
+        forget_superseded(store)
     print(f"everything is in {out}")
     others = sorted({*files_before(out, begin_s)} - old)
     if others:

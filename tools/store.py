@@ -45,6 +45,8 @@ CREATE TABLE entry(
     id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, kind TEXT NOT NULL, label TEXT NOT NULL,
     run INTEGER REFERENCES run(id), value BLOB NOT NULL);
 """
+INDEX = "CREATE INDEX IF NOT EXISTS entry_by_kind ON entry(kind)"
+"""Without it, whoever asks for a kind reads through the whole file."""
 
 
 class Store:
@@ -205,6 +207,19 @@ class Store:
                 self._base.executemany("DELETE FROM entry WHERE id = ?", gone)
                 self._base.execute("COMMIT")
 
+    def forget_older(self, kinds: Sequence[str], most: int) -> None:
+        """Remove what was superseded: of each label of these kinds, all but the latest few.
+
+        Args:
+            kinds: those of which a run makes few and the next seldom needs more than the last.
+            most: entries that stay of each label.
+        """
+        newest = "row_number() OVER (PARTITION BY kind, label ORDER BY id DESC) AS place"
+        of = f"SELECT id, {newest} FROM entry WHERE kind IN ({_marks(kinds)})"  # noqa: S608
+        with self._told(), self._guard:
+            remove = f"DELETE FROM entry WHERE id IN (SELECT id FROM ({of}) WHERE place > ?)"  # noqa: S608
+            self._base.execute(remove, (*kinds, most))
+
     def kept(self, kind: str, label: str, parts: Sequence[object], work: Callable[[], Any]) -> Any:  # noqa: ANN401
         """Return what work gives, from the entry of its key where there is one.
 
@@ -279,6 +294,7 @@ def _opened(path: Path | None) -> sqlite3.Connection:
         elif found != VERSION:  # its groundfuse would take new entries for damaged ones
             base.execute(f"PRAGMA user_version={VERSION}")
         base.execute("PRAGMA journal_mode=WAL")
+        base.execute(INDEX)
         base.execute("PRAGMA wal_autocheckpoint=4096")
     except BaseException:
         base.close()
