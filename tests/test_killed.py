@@ -16,11 +16,17 @@ from groundfuse.tools import fuse_team
 ROOT = Path(__file__).parents[1]
 SETTINGS = [word for setting in QUICK for word in ("--set", setting)]
 TIMED = {"report.txt", "store.sqlite", "store.sqlite.lock"}
+BY_FILE = [str(ROOT / "tools" / "fuse_team.py")]
+INSTALLED = [
+    "-c",
+    "from groundfuse.tools import installed; raise SystemExit(installed.fuse_team())",
+]
+"""What the installed command does."""
 
 
-def start(out, *more, preexec_fn=None):
-    command = [sys.executable, str(ROOT / "tools" / "fuse_team.py"), "--team", str(painted_pair())]
-    command += ["--out", str(out), "--quiet", "--no-mosaic", *SETTINGS, *more]
+def start(out, *more, preexec_fn=None, way=BY_FILE):
+    command = [sys.executable, *way, "--team", str(painted_pair()), "--out", str(out)]
+    command += ["--quiet", "--no-mosaic", *SETTINGS, *more]
     both = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
     return subprocess.Popen(command, **both, text=True, preexec_fn=preexec_fn)  # noqa: PLW1509
 
@@ -72,12 +78,12 @@ def heeding_ctrl_c():
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-@pytest.mark.parametrize("share", [0.15, 0.6])
-def test_interrupted_it_says_so_in_one_line_and_goes_on(undisturbed, tmp_path, share):
+@pytest.mark.parametrize(("share", "way"), [(0.15, INSTALLED), (0.6, BY_FILE)])
+def test_interrupted_it_says_so_in_one_line_and_goes_on(undisturbed, tmp_path, share, way):
     """Ctrl-C while it looks at pictures, and while it compares pairs."""
     wanted, full = undisturbed
     out = tmp_path / "out"
-    process = start(out, preexec_fn=heeding_ctrl_c)
+    process = start(out, preexec_fn=heeding_ctrl_c, way=way)
     while process.poll() is None and stored_bytes(out) < share * full:
         time.sleep(0.002)
     process.send_signal(signal.SIGINT)
@@ -93,11 +99,12 @@ def test_interrupted_it_says_so_in_one_line_and_goes_on(undisturbed, tmp_path, s
     assert content(out) == wanted
 
 
-def test_interrupted_amid_its_imports_it_ends_without_a_word(tmp_path, monkeypatch):
+@pytest.mark.parametrize("way", [BY_FILE, INSTALLED], ids=["file", "installed"])
+def test_interrupted_amid_its_imports_it_ends_without_a_word(tmp_path, monkeypatch, way):
     stand_in = "import os, signal, time\nos.kill(os.getpid(), signal.SIGINT)\ntime.sleep(30)\n"
     (tmp_path / "cv2.py").write_text(stand_in)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
-    process = start(tmp_path / "out", preexec_fn=heeding_ctrl_c)
+    process = start(tmp_path / "out", preexec_fn=heeding_ctrl_c, way=way)
     text, _ = process.communicate(timeout=25)
     assert (process.returncode, text) == (-signal.SIGINT, "")
 

@@ -66,7 +66,8 @@ def test_the_wheel_says_what_it_is(wheel):
         info = f"groundfuse-{PROJECT['version']}.dist-info"
         metadata = archive.read(f"{info}/METADATA").decode()
         commands = archive.read(f"{info}/entry_points.txt").decode()
-    assert "fuse-team = groundfuse.tools.fuse_team:main" in commands
+    for name in ("fuse_team", "fuse_graphs", "simulate_team"):
+        assert f"{name.replace('_', '-')} = groundfuse.tools.installed:{name}\n" in commands
     assert f"{info}/licenses/LICENSE" in members(wheel)
     assert "License-Expression: Apache-2.0" in metadata
     for line in PROJECT["dependencies"]:
