@@ -52,10 +52,12 @@ def _border_rays(camera: Camera) -> Points:
     return rays[np.isfinite(rays).all(axis=1)]
 
 
+@functools.lru_cache(maxsize=64)
 def _farthest_ray(camera: Camera) -> float:
     return float(np.hypot(*_border_rays(camera).T).max())
 
 
+@functools.lru_cache(maxsize=2**15)
 def _box(view: View) -> tuple[Points, Points]:
     """Lowest and highest x, y (2,) of the world that a view may count."""
     reach = RANGE_PER_HEIGHT * view.attitude.height_m
@@ -115,7 +117,10 @@ def true_overlap(a: View, b: View, step_per_height: float = STEP_PER_HEIGHT) -> 
     smaller = min(float(len(counted)), len(other) * scale)
     if smaller == 0.0:
         return 0.0
-    return min(1.0, float(np.count_nonzero(in_view(higher, counted))) / smaller)
+    low, high = _box(higher)
+    x, y = counted.T
+    meets = (x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1])
+    return min(1.0, float(np.count_nonzero(in_view(higher, counted[meets]))) / smaller)
 
 
 def near_pairs(a: Sequence[View], b: Sequence[View]) -> Iterator[tuple[int, int]]:
