@@ -67,6 +67,14 @@ def test_the_pictures_are_those_of_the_scene(team):
     assert np.abs(written - frame.image).mean() < 3.0  # what JPEG of quality 90 loses
 
 
+def test_more_threads_take_the_same_pictures():
+    scene = scene_of(["--out", "x", *ARGUMENTS])
+    one, three = (list(photographs(scene, Photometry(), threads)) for threads in (1, 3))
+    assert [frame.id for frame in three] == list(scene.by_frame())
+    for alone, beside in zip(one, three, strict=True):
+        np.testing.assert_array_equal(alone.image, beside.image)
+
+
 def test_the_sidecars_state_what_was_rendered(team):
     views = scene_of(["--out", "x", *ARGUMENTS]).by_frame()
     found = rows(team / "truth_attitude.csv")
@@ -114,6 +122,7 @@ def test_pictures_are_not_written_over(team, capsys):
         (["--seed", "-1"], "--seed must be at least 0, got -1"),
         (["--obstacles", "-1"], "--obstacles must be at least 0, got -1"),
         (["--width", "79"], "--width must be at least 80, got 79"),
+        (["--workers", "0"], "--workers must be at least 1, got 0"),
         (["--quality", "101"], "--quality must be at most 100, got 101"),
         (["--step", "0"], "--step must be positive, got 0"),
         (["--noise", "-2"], "photometry must not be negative, got -2"),

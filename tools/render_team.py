@@ -7,6 +7,7 @@ import re
 import sys
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -88,6 +89,8 @@ def parser() -> argparse.ArgumentParser:
     add("--height-sigma", type=float, metavar="METRES", help="wobble (2 mm at 0.55 m)")
     add("--noise", type=float, default=1.5, metavar="GREY", help="of the sensor at mid-grey (1.5)")
     add("--quality", type=int, default=90, metavar="1-100", help="of the JPEG pictures (90)")
+    cores = os.cpu_count() or 1
+    add("--workers", type=int, default=cores, metavar="N", help="threads (all cores)")
     return command
 
 
@@ -148,6 +151,7 @@ def plan_scene(args: argparse.Namespace) -> Scene:
         ("quality", 1),
         ("seed", 0),
         ("width", LEAST_WIDTH),
+        ("workers", 1),
     ):
         if getattr(args, name) < least:
             raise ValueError(f"--{name} must be at least {least}, got {getattr(args, name)}")
@@ -181,8 +185,9 @@ def render(args: argparse.Namespace) -> None:
             raise DataError(f"{images}: there already, choose a new folder or remove it")
     write_truth(args.out, scene)
     number = len(scene.by_frame())
-    for frame in tqdm(photographs(scene, photometry), total=number, unit="view", disable=None):
-        write_picture(args.out, frame.id, frame.image, args.quality)
+    with closing(photographs(scene, photometry, args.workers)) as frames:
+        for frame in tqdm(frames, total=number, unit="view", disable=None):
+            write_picture(args.out, frame.id, frame.image, args.quality)
     print(f"{args.out}: {number} pictures of {args.floor}, seed {args.seed}")
     _print_meetings(scene)
 

@@ -4,7 +4,7 @@ Shared by the tests, the benches and `render_team.py`. Everything follows from t
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +17,7 @@ from groundfuse.tools.obstacles import Obstacle
 from groundfuse.tools.overlap import View, all_overlaps, counted_floor, true_overlap
 from groundfuse.tools.photometry import Photometry, photograph
 from groundfuse.tools.render import World, render_view
+from groundfuse.tools.workers import in_threads
 
 FREE_PER_HEIGHT = 0.35  # no obstacle stands nearer to a camera's foot, in camera heights
 OBSTACLE_TRIES = 400
@@ -211,16 +212,22 @@ def set_scene(
     return Scene(World(raster, solids), tuple(robots), tuple(views), seed)
 
 
-def photographs(scene: Scene, photometry: Photometry) -> Iterator[RenderedFrame]:
-    """Take the pictures one by one, robot after robot; each is the same whatever came before.
+def photographs(
+    scene: Scene, photometry: Photometry, num_threads: int = 1
+) -> Generator[RenderedFrame, None, None]:
+    """Take the pictures, robot after robot; each is the same whatever came before.
 
     Raises:
         ValueError: a lens that has no ray for a pixel.
     """
     numbers = {robot.name: k for k, robot in enumerate(scene.robots)}
-    for frame, view in scene.by_frame().items():
+
+    def taken(item: tuple[FrameId, View]) -> RenderedFrame:
+        frame, view = item
         rng = np.random.default_rng([scene.seed, LIGHT, numbers[frame.robot], frame.index])
-        yield RenderedFrame(frame, take(scene.world, view, photometry, rng), view)
+        return RenderedFrame(frame, take(scene.world, view, photometry, rng), view)
+
+    return in_threads(taken, scene.by_frame().items(), num_threads)
 
 
 def make_team(
