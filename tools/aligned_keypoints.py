@@ -4,6 +4,7 @@ The bundle joins keypoints of many pairs into floor points. Here each of those i
 its pictures at once, so that a keypoint of several pairs stays one keypoint.
 """
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -42,6 +43,8 @@ Keys = np.ndarray[tuple[int], np.dtype[np.uint64]]
 KIND = "patches"
 OTHER = np.uint64(0x9E3779B97F4A7C15)
 """Odd: makes what a keypoint is laid on count otherwise than the keypoint itself."""
+LEAST_M = 1e-9
+"""Width of a floor that has none."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -190,14 +193,14 @@ def _align(
     """Align what is left and write it down.
 
     As many keypoints at a time as there is room for read their patches, view by view of their
-    finest, and are then laid on, view by view of their own: however far apart two views of a place
-    were taken, few pictures are read more than once.
+    finest, and are then laid on, view by view of their own. Those of one time lie near each other:
+    however far apart two views of a place were taken, few pictures are read more than once.
     """
     pictures: Cache[GreyPicture] = Cache(
         lambda number: grey_picture(views[number], options), options.cache_bytes
     )
     most = max(1, options.cache_bytes // empty_templates(1, options).nbytes)
-    parts = [left[first : first + most] for first in range(0, len(left), most)]
+    parts = near_parts(left, points.floor[points.finest[left]], most)
 
     def steps() -> Iterator[None]:
         for part in parts:
@@ -208,6 +211,24 @@ def _align(
     total = sum(len(_by(points.view[n])) for part in parts for n in (part, points.finest[part]))
     for _ in desk.progress(steps(), total, "keypoints"):
         pass
+
+
+def near_parts(which: Integers, floor: Array, most: int) -> list[Integers]:
+    """Split numbers (n,) into parts of at most so many, each of a piece of floor.
+
+    Args:
+        which: the numbers.
+        floor: (n, 2) where each lies, m.
+        most: in a part.
+    """
+    num = -(-len(which) // most)
+    if num > 1:
+        low, high = floor.min(axis=0), floor.max(axis=0)
+        num_strips = math.ceil(math.sqrt(num))  # so that parts are about as long as wide
+        strip = np.floor((floor[:, 1] - low[1]) / max(high[1] - low[1], LEAST_M) * num_strips)
+        back_and_forth = np.where(strip % 2.0 == 0.0, floor[:, 0], -floor[:, 0])
+        which = which[np.lexsort((back_and_forth, strip))]
+    return [which[first : first + most] for first in range(0, len(which), most)]
 
 
 def _align_part(
