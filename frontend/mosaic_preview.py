@@ -2,6 +2,7 @@
 
 import math
 
+import cv2
 import numpy as np
 
 from groundfuse.frontend.arrays import Image, Picture32
@@ -34,27 +35,35 @@ class Preview:
     def add(self, block: Block, tile: Tile) -> None:
         """Take one tile, whose first row and column are multiples of the factor."""
         row, column = (part.start // self._factor for part in block)
-        count = self._groups(tile.count).max(axis=(1, 3))
-        place = slice(row, row + count.shape[0]), slice(column, column + count.shape[1])
-        seen = (tile.count > 0).astype(np.float32)
-        share = self._groups(seen).sum(axis=(1, 3))
+        share = self._means(tile.count > 0)
+        place = slice(row, row + share.shape[0]), slice(column, column + share.shape[1])
         self._floor[place] = self._reduced(tile.floor, share)
         self._mean[place] = self._reduced(tile.mean, share)
-        self._count[place] = count
+        along = np.arange(0, tile.count.shape[1], self._factor)
+        down = np.arange(0, tile.count.shape[0], self._factor)
+        most = np.maximum.reduceat(np.maximum.reduceat(tile.count, down, axis=0), along, axis=1)
+        self._count[place] = most
 
-    def _groups(self, cells: np.ndarray) -> np.ndarray:
-        """Return (n, factor, m, factor, ...) of cells (rows, columns, ...), filled up by zeros."""
+    def _means(self, cells: np.ndarray) -> Picture32:
+        """Return the means of groups of cells (rows, columns, ...), filled up by zeros.
+
+        Exact: a group's sum is below 2 ** 24, and its size a power of two.
+        """
         rows, columns = cells.shape[:2]
-        more = [(0, -rows % self._factor), (0, -columns % self._factor)]
-        full = np.pad(cells, more + [(0, 0)] * (cells.ndim - 2))
-        sides = full.shape[0] // self._factor, full.shape[1] // self._factor
-        shape = (sides[0], self._factor, sides[1], self._factor, *cells.shape[2:])
-        return full.reshape(shape)
+        sides = -(-rows // self._factor), -(-columns // self._factor)
+        below, beside = sides[0] * self._factor - rows, sides[1] * self._factor - columns
+        full = cells.astype(np.float32)
+        if below or beside:
+            full = cv2.copyMakeBorder(full, 0, below, 0, beside, cv2.BORDER_CONSTANT, value=0.0)
+        means = cv2.resize(full, sides[::-1], interpolation=cv2.INTER_AREA)
+        return np.asarray(means, dtype=np.float32)
 
     def _reduced(self, colours: Image, share: Picture32) -> Image:
         """Mean of the seen cells: the others are 0 and don't count."""
-        total = self._groups(colours).sum(axis=(1, 3), dtype=np.float32)
-        mean: Image = np.rint(total / np.maximum(share, 1.0)[..., None]).astype(np.uint8)
+        least = np.float32(1.0 / self._factor**2)
+        mean: Image = np.rint(self._means(colours) / np.maximum(share, least)[..., None]).astype(
+            np.uint8
+        )
         return mean
 
     def finished(self) -> Mosaic:
