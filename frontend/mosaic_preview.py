@@ -52,7 +52,7 @@ class Preview:
         rows, columns = cells.shape[:2]
         sides = -(-rows // self._factor), -(-columns // self._factor)
         below, beside = sides[0] * self._factor - rows, sides[1] * self._factor - columns
-        full = cells.astype(np.float32)
+        full: np.ndarray = cells.astype(np.float32)
         if below or beside:
             full = cv2.copyMakeBorder(full, 0, below, 0, beside, cv2.BORDER_CONSTANT, value=0.0)
         means = cv2.resize(full, sides[::-1], interpolation=cv2.INTER_AREA)
