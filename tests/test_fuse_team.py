@@ -9,6 +9,7 @@ import math
 import os
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 from collections import Counter
@@ -781,9 +782,14 @@ def test_the_examples_of_the_help_are_valid():
         assert isinstance(fuse_team._options(asked), RunOptions)
 
 
-def test_the_installed_command_is_this_one():
-    (command,) = [e for e in entry_points(group="console_scripts") if e.name == "fuse-team"]
-    assert command.load() is fuse_team.main
+@pytest.mark.parametrize("name", ["fuse_team", "fuse_graphs", "simulate_team"])
+def test_an_installed_command_is_the_file_of_its_name(monkeypatch, name):
+    monkeypatch.setattr(f"groundfuse.tools.{name}.main", lambda: 7)
+    scripts = entry_points(group="console_scripts")
+    (command,) = [e for e in scripts if e.name == name.replace("_", "-")]
+    before = signal.getsignal(signal.SIGINT)
+    assert command.load()() == 7
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_bars_are_for_terminals():
