@@ -8,6 +8,8 @@ from typing import TypeVar
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+AHEAD = 4
+"""Items begun per thread before the first is taken."""
 
 
 def in_order(
@@ -26,3 +28,17 @@ def in_order(
     finally:
         for future in begun:
             future.cancel()
+
+
+def in_threads(
+    work: Callable[[Item], Result], items: Iterable[Item], num_threads: int
+) -> Generator[Result, None, None]:
+    """Yield `work` of each item, in the order of the items, whatever the number of threads.
+
+    Few items are begun ahead of what is taken, and none after the last that is.
+    """
+    if num_threads == 1:
+        yield from map(work, items)
+        return
+    with ThreadPoolExecutor(num_threads) as pool:
+        yield from in_order(pool, work, items, AHEAD * num_threads)

@@ -21,6 +21,7 @@ from groundfuse.backend.measurement import (
     RelativePose,
     Se2,
 )
+from groundfuse.frontend.ahead import AHEAD, in_threads
 from groundfuse.frontend.consensus import Gate
 from groundfuse.frontend.fit import Prior
 from groundfuse.frontend.overhead import floor_from_rays
@@ -36,7 +37,7 @@ from groundfuse.tools.pair_verdict import Spot, compare, look, odometry_gate, sw
 from groundfuse.tools.robot import Frame, Odometry, Robot
 from groundfuse.tools.similar import similar_pairs
 from groundfuse.tools.store import Store
-from groundfuse.tools.workers import AHEAD, Threads, in_threads, silent
+from groundfuse.tools.workers import Threads, silent
 
 BARREL = (-0.2, 0.05, 1e-3, -8e-4, 0.0)
 CAMERAS = {

@@ -15,6 +15,7 @@ from groundfuse.backend.bundle_sample import sampled
 from groundfuse.backend.bundle_tracks import Links, Matched, Sightings, matched, mixed_keys, tracks
 from groundfuse.backend.measurement import Array, FrameId, RelativePose, TeamEstimate
 from groundfuse.backend.ordering import stable_order
+from groundfuse.frontend.ahead import in_threads
 from groundfuse.frontend.arrays import Image
 from groundfuse.frontend.patches import (
     Aligned,
@@ -37,7 +38,7 @@ from groundfuse.tools.packing import digest_of, key_of, packed
 from groundfuse.tools.robot import Frame, Robot
 from groundfuse.tools.store import Store
 from groundfuse.tools.team_folder import load_image
-from groundfuse.tools.workers import Progress, in_threads
+from groundfuse.tools.workers import Progress
 
 Keys = np.ndarray[tuple[int], np.dtype[np.uint64]]
 KIND = "patches"

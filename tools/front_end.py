@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groundfuse.backend.measurement import FrameId, Rejected, RelativePose
+from groundfuse.frontend.ahead import in_threads
 from groundfuse.frontend.pairs import Pair, neighbour_pairs, skip_pairs
 from groundfuse.tools.frame_look import LookJob, look_job
 from groundfuse.tools.front_end_options import FrontEndOptions, comparable
@@ -20,7 +21,7 @@ from groundfuse.tools.robot import Robot
 from groundfuse.tools.shelf import AllFeatures, Shelf
 from groundfuse.tools.similar import similar_pairs
 from groundfuse.tools.store import Store
-from groundfuse.tools.workers import Progress, Workers, in_threads
+from groundfuse.tools.workers import Progress, Workers
 
 Stage = Callable[[str], AbstractContextManager[None]]
 READERS = 4

@@ -63,8 +63,9 @@ def new_geotiff(path: Path, grid: Grid) -> Iterator[GeoTiff]:
     part = make_folder(path.parent) / f".{secrets.token_hex(8)}.part.tif"
     try:
         # Threads only deflate: the bytes are those of one.
-        settings = {"GDAL_CACHEMAX": GDAL_CACHE_MB, "GDAL_NUM_THREADS": "ALL_CPUS"}
-        with rasterio.Env(**settings, GDAL_PAM_ENABLED=False):
+        with rasterio.Env(
+            GDAL_CACHEMAX=GDAL_CACHE_MB, GDAL_NUM_THREADS="ALL_CPUS", GDAL_PAM_ENABLED=False
+        ):
             with rasterio.open(part, "w", **_profile(grid)) as file:
                 yield GeoTiff(file)
             _add_overviews(part, grid)

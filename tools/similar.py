@@ -14,7 +14,7 @@ from itertools import islice
 import numpy as np
 
 from groundfuse.backend.measurement import FrameId
-from groundfuse.frontend.ahead import Result
+from groundfuse.frontend.ahead import Result, in_threads
 from groundfuse.frontend.arrays import Mask
 from groundfuse.frontend.features import Features
 from groundfuse.frontend.pairs import Pair, retrieved_pairs, sample_of
@@ -33,7 +33,6 @@ from groundfuse.frontend.retrieval_votes import Kin
 from groundfuse.tools.code_version import code_of
 from groundfuse.tools.packing import key_of, packed
 from groundfuse.tools.store import TOGETHER, Store
-from groundfuse.tools.workers import in_threads
 
 
 def similar_pairs(

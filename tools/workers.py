@@ -1,17 +1,13 @@
 """Who does the work: threads of this process, and what stands in their place on a cluster."""
 
-from collections.abc import Callable, Generator, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Generator, Iterable, Sequence
 from typing import Protocol
 
-from groundfuse.frontend.ahead import Item, Result, in_order
+from groundfuse.frontend.ahead import Result, in_threads
 from groundfuse.tools.frame_look import LookJob, look_done, picture_of
 from groundfuse.tools.front_end_options import FrontEndOptions
 from groundfuse.tools.pair_verdict import PairJob, pair_done
 from groundfuse.tools.shelf import Shelf
-
-AHEAD = 4
-"""Items begun per thread before the first is taken."""
 
 
 class Progress(Protocol):
@@ -72,17 +68,3 @@ class Threads:
             return job, pair_done(job, a, b, options)
 
         return in_threads(done, jobs, self.num_threads)
-
-
-def in_threads(
-    work: Callable[[Item], Result], items: Iterable[Item], num_threads: int
-) -> Generator[Result, None, None]:
-    """Yield `work` of each item, in the order of the items, whatever the number of threads.
-
-    Few items are begun ahead of what is taken, and none after the last that is.
-    """
-    if num_threads == 1:
-        yield from map(work, items)
-        return
-    with ThreadPoolExecutor(num_threads) as pool:
-        yield from in_order(pool, work, items, AHEAD * num_threads)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groundfuse.backend.measurement import Attitude, FrameId, Se2
+from groundfuse.frontend.ahead import in_threads
 from groundfuse.frontend.arrays import Image
 from groundfuse.frontend.camera import Camera
 from groundfuse.tools.floors import make_floor
@@ -17,7 +18,6 @@ from groundfuse.tools.obstacles import Obstacle
 from groundfuse.tools.overlap import View, all_overlaps, counted_floor, true_overlap
 from groundfuse.tools.photometry import Photometry, photograph
 from groundfuse.tools.render import World, render_view
-from groundfuse.tools.workers import in_threads
 
 FREE_PER_HEIGHT = 0.35  # no obstacle stands nearer to a camera's foot, in camera heights
 OBSTACLE_TRIES = 400
